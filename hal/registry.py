@@ -1,0 +1,62 @@
+"""Backends by name: lazy `"module:attribute"` strings, so that listing them imports no SDK and no simulator."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from importlib import import_module
+from typing import Any, Generic, TypeVar
+
+from hal.arm import Arm
+from hal.camera import Camera
+from hal.errors import UnknownBackendError
+
+T = TypeVar("T")
+
+
+class Registry(Generic[T]):
+    """Names of one kind of backend."""
+
+    def __init__(self, kind: str, entries: Mapping[str, str]) -> None:
+        self._kind = kind
+        self._entries = dict(entries)
+
+    def register(self, name: str, target: str) -> None:
+        """Add `name` as `"module:attribute"`.
+
+        Raises:
+            ValueError: the name is taken.
+        """
+        if name in self._entries:
+            raise ValueError(f"{self._kind} backend {name!r} is registered already, as {self._entries[name]}.")
+        self._entries[name] = target
+
+    def names(self) -> list[str]:
+        """Return all names, sorted."""
+        return sorted(self._entries)
+
+    def make(self, name: str, **options: Any) -> T:
+        """Import the backend and call it with `options`.
+
+        Raises:
+            UnknownBackendError: no such name; the message lists the known ones.
+        """
+        if name not in self._entries:
+            raise UnknownBackendError(self._kind, name, self._entries)
+        module, attribute = self._entries[name].split(":")
+        return getattr(import_module(module), attribute)(**options)
+
+
+ARMS: Registry[Arm] = Registry(
+    "arm",
+    {
+        "mock": "hal.backends.mock_arm:MockArm",
+        "sim": "sim_twin.backends:TwinArm",
+    },
+)
+CAMERAS: Registry[Camera] = Registry(
+    "camera",
+    {
+        "replay": "hal.backends.replay_camera:ReplayCamera",
+        "sim": "sim_twin.backends:TwinCamera",
+    },
+)

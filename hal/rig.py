@@ -1,0 +1,35 @@
+"""A rig is what one robot is made of: an arm, a camera, and the clock they live by."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from hal.arm import Arm
+from hal.camera import Camera
+from hal.clock import Clock
+from hal.registry import Registry
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Rig:
+    """One robot's devices, not yet connected."""
+
+    arm: Arm
+    camera: Camera
+    clock: Clock
+    call_every_tick: Callable[[Callable[[], None]], None] | None = None
+    """In lock-step: registers what the clock calls every control period while somebody sleeps on it. None when the
+    clock is the wall's, where `hal.servo.ServoThread` does the calling."""
+    world: Any = None
+    """The simulated world behind the devices, for evaluation only; None on a real robot."""
+
+
+RIGS: Registry[Rig] = Registry(
+    "rig",
+    {
+        "mock": "hal.backends.mock_arm:make_rig",
+        "sim": "sim_twin.backends:make_rig",
+    },
+)

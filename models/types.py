@@ -1,0 +1,73 @@
+"""What the models give each other, all in the camera's optical frame (x right, y down, z forward)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class GraspSet:
+    """Candidate grasps of a parallel jaw, in the paper's grasp frame.
+
+    z is the approach, y runs along the finger opening, the origin lies midway between the fingertips.
+    """
+
+    T_camera_grasps: np.ndarray
+    """(N, 4, 4) grasp poses."""
+    scores: np.ndarray
+    """(N,) confidence in [0, 1]."""
+    widths_m: np.ndarray
+    """(N,) distance between the two contacts along y [m]; NaN where the generator does not say."""
+    source: str = ""
+    """Which generator made them."""
+
+    def __post_init__(self) -> None:
+        n = len(self.T_camera_grasps)
+        if self.T_camera_grasps.shape != (n, 4, 4) or self.scores.shape != (n,) or self.widths_m.shape != (n,):
+            raise ValueError(
+                f"GraspSet wants (N, 4, 4), (N,), (N,); got {self.T_camera_grasps.shape}, "
+                f"{self.scores.shape}, {self.widths_m.shape}."
+            )
+        for array in (self.T_camera_grasps, self.scores, self.widths_m):
+            array.setflags(write=False)
+
+    def __len__(self) -> int:
+        return len(self.scores)
+
+    def __getitem__(self, index: np.ndarray | slice) -> GraspSet:
+        """Return the grasps that `index` (a slice, a mask or an array of indices) picks, in its order."""
+        return GraspSet(
+            T_camera_grasps=self.T_camera_grasps[index],
+            scores=self.scores[index],
+            widths_m=self.widths_m[index],
+            source=self.source,
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Detection:
+    """One object found in an image."""
+
+    label: str
+    """Class name."""
+    confidence: float
+    """In [0, 1]."""
+    box_px: tuple[int, int, int, int]
+    """(u_min, v_min, u_max, v_max), the upper ends exclusive [px]."""
+    mask: np.ndarray | None = field(default=None)
+    """(H, W) bool, the object's pixels, where the detector knows them."""
+
+
+class GraspGenerator(Protocol):
+    """Proposes grasps for an object's points; knows neither arm, table nor gravity."""
+
+    def sample(self, points: np.ndarray, n: int, seed: int) -> GraspSet:
+        """Return `n` grasps in the frame of `points` (M, 3) [m]; the same seed gives the same grasps.
+
+        Raises:
+            ValueError: too few points, or points that are not finite.
+        """
+        ...

@@ -1,0 +1,117 @@
+"""What the stages of a pick hand to each other; each is made once and never changed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from hal.messages import RgbdFrame
+from models.types import Detection, GraspSet
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Plane:
+    """The table: all p with `normal @ p = offset_m`, in the frame its owner names."""
+
+    normal: np.ndarray
+    """(3,) unit vector, out of the table towards the camera."""
+    offset_m: float
+    """Signed distance of the plane from the origin along `normal` [m]."""
+
+    def height_m(self, points: np.ndarray) -> np.ndarray:
+        """Return the (N,) heights [m] of `points` (N, 3) above the plane."""
+        return points @ self.normal - self.offset_m
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Observation:
+    """What perception makes of one frame. Clouds and plane are in the camera's optical frame [m]."""
+
+    frame: RgbdFrame
+    T_base_camera: np.ndarray
+    """(4, 4) camera pose when the frame was taken."""
+    detection: Detection
+    """The object that was chosen."""
+    object_points: np.ndarray
+    """(N, 3) the object, outliers and table taken off."""
+    scene_points: np.ndarray
+    """(M, 3) everything else that was seen: the table, neighbours, walls; not the object."""
+    table: Plane
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class JointTrajectory:
+    """A timed path of the six arm joints and the gripper, sampled at the control period."""
+
+    t_s: np.ndarray
+    """(N,) times from the start [s], the first 0."""
+    q: np.ndarray
+    """(N, 7) positions [rad]."""
+    dq: np.ndarray
+    """(N, 7) velocities [rad/s]."""
+
+    @property
+    def duration_s(self) -> float:
+        """How long it takes [s]."""
+        return float(self.t_s[-1])
+
+    def pieces(self, length_s: float) -> Iterator[slice]:
+        """Yield index ranges that each span about `length_s` [s], in order, covering everything once."""
+        edges = np.searchsorted(self.t_s, np.arange(length_s, self.duration_s + length_s, length_s), side="right")
+        start = 0
+        for stop in edges:
+            if stop > start:
+                yield slice(start, int(stop))
+            start = int(stop)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Rejection:
+    """Why a candidate was not taken."""
+
+    rank: int
+    """Place of the candidate in the ranking, from 0."""
+    reason: str
+    """One word a table can count: `ik`, `path`, `table`, `scene`, `self`, `object`, `width`."""
+    detail: str
+    """The sentence a person reads, with the figures."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class GraspPlan:
+    """One grasp the arm can do, with the whole motion."""
+
+    rank: int
+    """Place of the executed candidate in the ranking, from 0."""
+    T_base_grasp: np.ndarray
+    """(4, 4) the candidate, paper's grasp frame (z approach, y opening)."""
+    width_m: float
+    """Object width between the jaws [m]."""
+    T_base_pivot: np.ndarray
+    """(4, 4) gripper pivot at the grasp."""
+    jaw_open: float
+    """Mover angle while approaching [rad]."""
+    jaw_contact: float
+    """Mover angle at which the moving jaw should touch [rad]."""
+    transfer: JointTrajectory
+    """From where the arm is to the pre-grasp, jaw opening on the way."""
+    approach: JointTrajectory
+    """Straight from the pre-grasp to the grasp."""
+    lift: JointTrajectory
+    """Straight up with the object, jaw command closed."""
+    rejections: tuple[Rejection, ...]
+    """Why the candidates before this one were refused."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RankedGrasps:
+    """The candidates that passed the MVBB filter, best first."""
+
+    grasps: GraspSet
+    """(M) in ranked order, camera frame."""
+    indices: np.ndarray
+    """(M,) where each stood in the generator's own set."""
+    scores: np.ndarray
+    """(M,) the combined score, never rising."""
