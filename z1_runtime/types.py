@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hal.messages import RgbdFrame
-from models.types import Detection, GraspSet
+from models.types import Detection
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -103,15 +103,3 @@ class GraspPlan:
     """Straight up with the object, jaw command closed."""
     rejections: tuple[Rejection, ...]
     """Why the candidates before this one were refused."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class RankedGrasps:
-    """The candidates that passed the MVBB filter, best first."""
-
-    grasps: GraspSet
-    """(M) in ranked order, camera frame."""
-    indices: np.ndarray
-    """(M,) where each stood in the generator's own set."""
-    scores: np.ndarray
-    """(M,) the combined score, never rising."""
