@@ -1,0 +1,16 @@
+"""`./z1 test [pytest options]`: run the tests of this checkout."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def main(arguments: list[str]) -> int:
+    """Run pytest with `arguments` (default: everything that needs no hardware) and return its exit code."""
+    import pytest
+
+    os.chdir(ROOT)
+    return int(pytest.main(arguments))
