@@ -132,9 +132,7 @@ class Kinematics:
         inside = [q for q in solutions if (q >= _ARM_MIN - _LIMIT_ATOL).all() and (q <= _ARM_MAX + _LIMIT_ATOL).all()]
         return [np.clip(q, _ARM_MIN, _ARM_MAX) for q in inside]
 
-    def best(
-        self, T_base_pivot: np.ndarray, q_near: np.ndarray = z1.Q_HOME, *, least_squares: bool = True
-    ) -> IkResult:
+    def best(self, T_base_pivot: np.ndarray, q_near: np.ndarray = z1.Q_HOME, *, least_squares: bool = True) -> IkResult:
         """Return the solution that minimises ‖q − q_near‖² inside the limits (the paper's choice among branches).
 
         Args:
