@@ -1,0 +1,195 @@
+"""Who finds the object in the image: a contract and two implementations that need no weights."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import cv2
+import numpy as np
+
+from hal.messages import RgbdFrame
+from hal.z1 import T_FLANGE_CAMERA
+from models.types import Detection
+from z1_runtime.cloud import (
+    PerceptionError,
+    TableConfig,
+    back_project,
+    continuous_pixels,
+    expected_table,
+    fit_table,
+    inside_box,
+    transform,
+    valid_pixels,
+)
+
+
+class Detector(Protocol):
+    """Finds objects in a frame."""
+
+    classes: tuple[str, ...]
+    """Labels it can tell apart; empty when it knows no classes."""
+
+    def detect(self, frame: RgbdFrame, T_base_camera: np.ndarray) -> list[Detection]:
+        """Return what was found, most confident first; empty when there is nothing.
+
+        Args:
+            frame: the image.
+            T_base_camera: (4, 4) camera pose when it was taken.
+
+        Raises:
+            PerceptionError: the frame cannot be used.
+        """
+        ...
+
+
+def mask_box(mask: np.ndarray) -> tuple[int, int, int, int]:
+    """Return (u_min, v_min, u_max, v_max) of the (H, W) bool `mask`, upper ends exclusive [px]."""
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
+
+
+class TruthDetector:
+    """The twin's own mask, for evaluation: it shows what the rest does when detection is perfect."""
+
+    classes: tuple[str, ...] = ()
+
+    def detect(self, frame: RgbdFrame, T_base_camera: np.ndarray) -> list[Detection]:
+        """Return the one object of the truth mask; see `Detector.detect`."""
+        if frame.truth_mask is None:
+            raise PerceptionError("only the twin's frames carry a truth mask; use --detector tabletop.")
+        if not frame.truth_mask.any():
+            return []
+        mask = frame.truth_mask
+        return [Detection(label="object", confidence=1.0, box_px=mask_box(mask), mask=mask)]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OwnGripper:
+    """The part of the image's space that the robot's own jaws may fill, fixed to the camera."""
+
+    lower_m: tuple[float, float, float] = (-0.10, -0.055, -0.050)
+    """Lower corner in the flange frame [m]."""
+    upper_m: tuple[float, float, float] = (0.212, 0.055, 0.112)
+    """Upper corner in the flange frame [m]: what the meshes sweep over the whole jaw range, and 12 mm."""
+    T_flange_camera: np.ndarray = field(default_factory=lambda: T_FLANGE_CAMERA)
+    """(4, 4) hand-eye transform; nominal by default, the margin covers its calibration."""
+
+    def contains(self, points: np.ndarray) -> np.ndarray:
+        """Return the (N,) bool points (camera frame) that may be the robot itself."""
+        # The jaws end 0.23 m from the camera, so most of a scene need not be transformed to be cleared.
+        inside = np.zeros(len(points), bool)
+        corner = np.abs(np.array([self.lower_m, self.upper_m]) - self.T_flange_camera[:3, 3]).max(axis=0)
+        near = np.flatnonzero(points[:, 2] < np.linalg.norm(corner))
+        inside[near] = inside_box(
+            transform(self.T_flange_camera, points[near]), np.array(self.lower_m), np.array(self.upper_m)
+        )
+        return inside
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TabletopConfig:
+    """What counts as an object on the table."""
+
+    d_max_m: float = 1.0
+    """Depth beyond this is ignored [m]."""
+    workspace_lower_m: tuple[float, float, float] = (0.28, -0.30, 0.005)
+    """Lower corner of where objects may be, base frame [m]."""
+    workspace_upper_m: tuple[float, float, float] = (0.70, 0.30, 0.40)
+    """Upper corner [m]."""
+    min_height_m: float = 0.005
+    """Points lower than this above the table are table [m]; more where the depth noise is more."""
+    cell_m: float = 0.005
+    """Cell of the footprint grid [m]."""
+    min_cell_points: int = 3
+    """Points a cell needs; flying pixels and noise are thinner."""
+    join_m: float = 0.015
+    """Gaps in the footprint narrower than this are bridged [m]; wider ones part two objects."""
+    min_area_m2: float = 2e-4
+    """Smallest visible area, as seen from the camera [m²]."""
+    typical_area_m2: float = 5e-4
+    """Visible area at which confidence is one half [m²]."""
+    border_confidence: float = 0.3
+    """Factor on the confidence of what the image's border cuts: it is clutter, or too little is seen of it."""
+    table: TableConfig = field(default_factory=TableConfig)
+    own: OwnGripper = field(default_factory=OwnGripper)
+
+
+class TabletopDetector:
+    """Whatever stands on the table, by depth alone; the largest visible area comes first.
+
+    Points above the table are dropped onto it and clustered by their footprint, which joins the pieces that holes in
+    the depth cut out of one object: what is above the table rests on it.
+    """
+
+    classes: tuple[str, ...] = ()
+
+    def __init__(self, config: TabletopConfig | None = None) -> None:
+        self._config = config or TabletopConfig()
+
+    def detect(self, frame: RgbdFrame, T_base_camera: np.ndarray) -> list[Detection]:
+        """Return the objects on the table; see `Detector.detect`.
+
+        Raises:
+            NoTableError: the table is not in view.
+        """
+        config = self._config
+        seen = valid_pixels(frame.depth_m, config.d_max_m) & continuous_pixels(frame.depth_m)
+        points = back_project(frame.depth_m, frame.intrinsics, seen)
+        table = fit_table(points, expected_table(T_base_camera), config.table)
+        p_base = transform(T_base_camera, points)
+        standing = inside_box(p_base, np.array(config.workspace_lower_m), np.array(config.workspace_upper_m))
+        standing &= table.above(points, config.min_height_m) & ~config.own.contains(points)
+        index = np.flatnonzero(standing)
+        labels = self._footprint_labels(p_base[index])
+        pixels = np.flatnonzero(seen)[index]
+        area = points[index, 2] ** 2 / (frame.intrinsics.fx * frame.intrinsics.fy)
+        found = []
+        for label in range(1, int(labels.max(initial=0)) + 1):
+            member = labels == label
+            if (visible_m2 := float(area[member].sum())) >= config.min_area_m2:
+                found.append(self._detection(pixels[member], visible_m2, frame.depth_m))
+        return sorted(found, key=lambda detection: -detection.confidence)
+
+    def _footprint_labels(self, p_base: np.ndarray) -> np.ndarray:
+        """Return the (N,) cluster numbers of points by their x, y; 0 = none."""
+        config = self._config
+        lower, upper = np.array(config.workspace_lower_m[:2]), np.array(config.workspace_upper_m[:2])
+        shape = np.ceil((upper - lower) / config.cell_m).astype(int) + 1
+        column = ((p_base[:, :2] - lower) / config.cell_m).astype(int)
+        cell = np.ravel_multi_index((column[:, 0], column[:, 1]), tuple(shape))
+        filled = (np.bincount(cell, minlength=shape.prod()) >= config.min_cell_points).reshape(shape)
+        # Growing every cell by half the gap makes those closer than the gap touch.
+        grow = 2 * round(config.join_m / config.cell_m / 2) + 1
+        bridged = cv2.dilate(filled.astype(np.uint8), np.ones((grow, grow), np.uint8))
+        _, numbers = cv2.connectedComponents(bridged, connectivity=8)
+        return np.where(filled, numbers, 0).reshape(-1)[cell]
+
+    def _detection(self, pixels: np.ndarray, visible_m2: float, depth_m: np.ndarray) -> Detection:
+        config = self._config
+        mask = np.zeros(depth_m.shape, np.uint8)
+        mask.reshape(-1)[pixels] = 1
+        closed = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (9, 9)))
+        outlines, _ = cv2.findContours(closed, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+        filled = cv2.drawContours(np.zeros_like(mask), outlines, -1, 1, thickness=cv2.FILLED)
+        # Only what was not measured is filled in: a measured pixel inside the outline is the table or a neighbour.
+        whole = mask.astype(bool) | (filled.astype(bool) & (depth_m == 0))
+        box = u_min, v_min, u_max, v_max = mask_box(whole)
+        height, width = depth_m.shape
+        cut = u_min == 0 or v_min == 0 or u_max == width or v_max == height
+        confidence = visible_m2 / (visible_m2 + config.typical_area_m2) * (config.border_confidence if cut else 1.0)
+        return Detection(label="object", confidence=confidence, box_px=box, mask=whole)
+
+
+_DETECTORS: dict[str, type[Detector]] = {"tabletop": TabletopDetector, "truth": TruthDetector}
+
+
+def make_detector(name: str = "tabletop") -> Detector:
+    """Return the detector of that name.
+
+    Raises:
+        ValueError: no such name; the message lists the known ones.
+    """
+    if name not in _DETECTORS:
+        raise ValueError(f"there is no detector {name!r}; known: {', '.join(sorted(_DETECTORS))}.")
+    return _DETECTORS[name]()

@@ -1,0 +1,172 @@
+"""From one aligned RGB-D frame to the object's cloud, the scene's cloud and the table: the paper's perception."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from hal.messages import RgbdFrame
+from models.types import Detection
+from z1_runtime.cloud import (
+    PerceptionError,
+    TableConfig,
+    back_project,
+    box_pixels,
+    continuous_pixels,
+    depth_clip,
+    expected_table,
+    fit_table,
+    radius_inliers,
+    statistical_inliers,
+    subsample,
+    valid_pixels,
+    voxel_downsample,
+)
+from z1_runtime.detectors import Detector, OwnGripper
+from z1_runtime.types import Observation
+
+
+class NoDepthError(PerceptionError):
+    """The depth image is empty."""
+
+
+class NoDetectionError(PerceptionError):
+    """The detector found nothing (of the wanted class)."""
+
+
+class SmallCloudError(PerceptionError):
+    """Too few points of the object are left after filtering."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PerceptionConfig:
+    """Limits of the clouds; the paper's values where it gives one."""
+
+    d_max_m: float = 1.0
+    """Depth beyond this is dropped [m]."""
+    clip_percent: tuple[float, float] = (1.0, 99.0)
+    """Depth percentiles kept inside the crop [%]."""
+    statistical_k: int = 20
+    """Neighbours of the statistical filter."""
+    statistical_n_sigma: float = 2.0
+    """Its threshold, in standard deviations above the mean."""
+    radius_m: float = 0.010
+    """Radius of the radius filter [m]."""
+    radius_min_neighbours: int = 10
+    """Neighbours it wants within that radius."""
+    min_height_m: float = 0.005
+    """Points of the crop lower than this above the table are table [m]; more where the depth noise is more."""
+    voxel_m: float = 0.002
+    """Voxel of the object's cloud [m]; 0 = none."""
+    max_points: int = 5000
+    """Most points of the object's cloud."""
+    min_points: int = 100
+    """Fewest points of the object's cloud."""
+    table: TableConfig = field(default_factory=TableConfig)
+    own: OwnGripper = field(default_factory=OwnGripper)
+
+
+class Perception:
+    """Detects one object and cuts the clouds; `observe` is `detect` and then `segment`."""
+
+    def __init__(self, config: PerceptionConfig, detector: Detector) -> None:
+        self._config = config
+        self._detector = detector
+
+    def observe(self, frame: RgbdFrame, T_base_camera: np.ndarray, label: str | None = None) -> Observation:
+        """Return what is seen; arguments and errors as in `detect` and `segment`."""
+        return self.segment(frame, T_base_camera, self.detect(frame, T_base_camera, label))
+
+    def detect(self, frame: RgbdFrame, T_base_camera: np.ndarray, label: str | None = None) -> Detection:
+        """Return the most confident detection.
+
+        Args:
+            frame: the image.
+            T_base_camera: (4, 4) camera pose when it was taken.
+            label: the wanted class; ignored by a detector that knows no classes.
+
+        Raises:
+            NoDepthError: no depth pixel was measured.
+            NoDetectionError: nothing (of that class) was found.
+        """
+        _require_depth(frame)
+        found = self._detector.detect(frame, T_base_camera)
+        wanted = [d for d in found if label is None or not self._detector.classes or d.label == label]
+        if not wanted:
+            others = f"; it saw {', '.join(sorted({d.label for d in found}))}" if found else ""
+            raise NoDetectionError(
+                f"{type(self._detector).__name__} found no {label or 'object'}{others}. Put the object 0.40 to 0.56 m "
+                "in front of the arm, in view of the wrist camera, and look again."
+            )
+        return wanted[0]
+
+    def segment(self, frame: RgbdFrame, T_base_camera: np.ndarray, detection: Detection) -> Observation:
+        """Return the clouds and the table for one detection.
+
+        The object: crop by mask (or box) → 0 < d ≤ d_max → depth percentiles → table taken off → flying pixels, then
+        statistical and radius outliers dropped → voxels. The scene is every other measured point at full resolution,
+        without flying pixels and the robot's own gripper. What the filters dropped from the object is in neither: it
+        hangs around the object and would make every grasp collide.
+
+        Raises:
+            NoDepthError: no depth pixel was measured.
+            NoTableError: the table is not in view.
+            SmallCloudError: too little is left of the object; the message counts each stage.
+        """
+        _require_depth(frame)
+        config, depth = self._config, frame.depth_m
+        valid = valid_pixels(depth, config.d_max_m)
+        continuous = continuous_pixels(depth)
+        crop = detection.mask if detection.mask is not None else box_pixels(depth.shape, detection.box_px)
+
+        points = back_project(depth, frame.intrinsics, valid & (continuous | crop))
+        points_crop, points_continuous = (image[valid & (continuous | crop)] for image in (crop, continuous))
+        own = config.own.contains(points)
+        table = fit_table(points, expected_table(T_base_camera), config.table)
+        above = table.above(points, config.min_height_m)
+
+        candidates = points[points_crop & ~own]
+        keep = depth_clip(candidates, *config.clip_percent)
+        standing = keep & above[points_crop & ~own]
+        solid = standing & points_continuous[points_crop & ~own]
+        counts = {"crop": len(candidates), "depth clip": int(keep.sum()), "table off": int(standing.sum())}
+        object_points = self._clean(candidates[solid], counts)
+        if len(object_points) < config.min_points:
+            stages = ", ".join(f"{stage} {n}" for stage, n in counts.items())
+            raise SmallCloudError(
+                f"only {len(object_points)} points of the object are left, {config.min_points} are needed (points "
+                f"after each stage: {stages}). Move the object closer, or look at it from another side."
+            )
+        return Observation(
+            frame=frame,
+            T_base_camera=T_base_camera,
+            detection=detection,
+            object_points=object_points,
+            # The table under a box-shaped crop is scene; what stands inside the crop is not.
+            scene_points=points[points_continuous & ~own & ~(points_crop & above)],
+            table=table.plane,
+        )
+
+    def _clean(self, points: np.ndarray, counts: dict[str, int]) -> np.ndarray:
+        """Return the object's points without outliers, thinned; note the count after each stage in `counts`."""
+        config = self._config
+        counts["flying off"] = len(points)
+        # Twice the final size bounds the neighbour searches, and voxels still have something to average.
+        points = points[subsample(points, 2 * config.max_points)]
+        points = points[statistical_inliers(points, config.statistical_k, config.statistical_n_sigma)]
+        counts["statistical"] = len(points)
+        points = points[radius_inliers(points, config.radius_m, config.radius_min_neighbours)]
+        counts["radius"] = len(points)
+        if config.voxel_m > 0:
+            points = voxel_downsample(points, config.voxel_m)
+            counts["voxel"] = len(points)
+        return points[subsample(points, config.max_points)]
+
+
+def _require_depth(frame: RgbdFrame) -> None:
+    if not (frame.depth_m > 0).any():
+        raise NoDepthError(
+            "the depth image holds no measurement (all zero); check that the lens is free, that it is light enough and "
+            "that the object is more than 0.07 m away."
+        )
