@@ -59,12 +59,11 @@ class JointTrajectory:
 
     def pieces(self, length_s: float) -> Iterator[slice]:
         """Yield index ranges that each span about `length_s` [s], in order, covering everything once."""
-        edges = np.searchsorted(self.t_s, np.arange(length_s, self.duration_s + length_s, length_s), side="right")
         start = 0
-        for stop in edges:
-            if stop > start:
-                yield slice(start, int(stop))
-            start = int(stop)
+        while start < len(self.t_s):
+            stop = int(np.searchsorted(self.t_s, self.t_s[start] + length_s, side="right"))
+            yield slice(start, stop)
+            start = stop
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
