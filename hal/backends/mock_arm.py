@@ -1,0 +1,129 @@
+"""An arm made of arithmetic: follows its setpoints with a lag, and breaks on request."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from hal.clock import Clock, WallClock
+from hal.errors import CommandRefusedError, HalTimeoutError, NotConnectedError
+from hal.messages import ArmSetpoint, ArmState
+from hal.rig import Rig
+from hal.z1 import KP, N_JOINTS, Q_HOME, Q_MAX, Q_MIN, TAU_MAX
+
+STALE_S = 0.1
+"""A measurement older than this is refused [s]."""
+
+
+class MockArm:
+    """Six joints and a gripper that follow first-order, for tests and for trying things without a robot.
+
+    Torque is the lag times the Z1's stiffness, as in its position servo.
+
+    Args:
+        clock: by which it moves; None = the wall's.
+        q: (7,) pose before the first setpoint [rad]; None = home with the jaws closed.
+        time_constant_s: of the following [s]; 0 follows at once.
+    """
+
+    def __init__(
+        self, clock: Clock | None = None, *, q: np.ndarray | None = None, time_constant_s: float = 0.01
+    ) -> None:
+        self.clock = clock or WallClock()
+        self._tau_s = time_constant_s
+        self._q = np.append(Q_HOME, 0.0) if q is None else np.array(q, dtype=float)
+        self._dq = np.zeros(N_JOINTS)
+        self._target = self._q.copy()
+        self._moved_s = 0.0
+        self._connected = False
+        self._faults: tuple[str, ...] = ()
+        self._frozen_s: float | None = None
+        self._blocked_q: np.ndarray | None = None
+        self.drop_commands = False
+        """Setpoints are lost on the way while this is set."""
+        self.refuse_commands = False
+        """Setpoints are refused while this is set."""
+        self.offset = np.zeros(N_JOINTS)
+        """(7,) constant following error: it settles at setpoint + offset [rad]."""
+
+    def connect(self) -> None:
+        self._connected = True
+        self._moved_s = self.clock.now_s()
+
+    def disconnect(self) -> None:
+        self._connected = False
+
+    def read_state(self) -> ArmState:
+        self._check_connected()
+        now_s = self.clock.now_s()
+        if self._frozen_s is not None and now_s - self._frozen_s > STALE_S:
+            raise HalTimeoutError(
+                f"the mock arm's newest measurement is {now_s - self._frozen_s:.3f} s old; allowed is {STALE_S} s."
+            )
+        self._move(now_s)
+        tau = np.clip(KP * (self._target - self._q), -TAU_MAX, TAU_MAX)
+        return ArmState(stamp_s=self._moved_s, q=self._q, dq=self._dq, tau=tau, faults=self._faults)
+
+    def send(self, setpoint: ArmSetpoint) -> ArmSetpoint:
+        self._check_connected()
+        if self.refuse_commands:
+            raise CommandRefusedError("the mock arm refuses commands, as it was told to.")
+        self._move(self.clock.now_s())
+        q = np.clip(setpoint.q, Q_MIN, Q_MAX)
+        if not self.drop_commands:
+            self._target = q
+        return ArmSetpoint(q=q, dq=np.where(q == setpoint.q, setpoint.dq, 0.0))
+
+    def stop(self) -> None:
+        if self._connected:
+            self._move(self.clock.now_s())
+            self._target = self._q.copy()
+
+    # --- Faults on request ------------------------------------------------------------------------------------
+
+    def inject_fault(self, *words: str) -> None:
+        """Report these faults from now on, for instance "overheat joint 2"; none clears them."""
+        self._faults = words
+
+    def freeze(self) -> None:
+        """Deliver no new measurement from now on."""
+        self._move(self.clock.now_s())
+        self._frozen_s = self._moved_s
+
+    def thaw(self) -> None:
+        """Undo `freeze`."""
+        self._frozen_s = None
+        self._moved_s = self.clock.now_s()
+
+    def block(self, joint: int | None) -> None:
+        """Keep this joint (0…6) where it is, whatever is sent; None lets all go."""
+        self._blocked_q = None
+        if joint is not None:
+            self._blocked_q = np.full(N_JOINTS, np.nan)
+            self._blocked_q[joint] = self._q[joint]
+
+    def _check_connected(self) -> None:
+        if not self._connected:
+            raise NotConnectedError("the mock arm")
+
+    def _move(self, now_s: float) -> None:
+        if self._frozen_s is not None:
+            return
+        dt_s = now_s - self._moved_s
+        if dt_s <= 0:
+            return
+        share = 1.0 if self._tau_s <= 0 else -np.expm1(-dt_s / self._tau_s)
+        q = self._q + share * (self._target + self.offset - self._q)
+        if self._blocked_q is not None:
+            q = np.where(np.isnan(self._blocked_q), q, self._blocked_q)
+        self._dq = (q - self._q) / dt_s
+        self._q, self._moved_s = q, now_s
+
+
+def make_rig(**_: Any) -> Rig:
+    """Return a rig of a mock arm and the built-in recording, on the wall clock; options are for other rigs."""
+    from hal.backends.replay_camera import ReplayCamera
+
+    clock = WallClock()
+    return Rig(arm=MockArm(clock), camera=ReplayCamera(clock=clock), clock=clock)

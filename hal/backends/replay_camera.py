@@ -1,0 +1,171 @@
+"""A camera that plays recorded frames, and the file they are recorded in."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+
+from hal.clock import Clock, WallClock
+from hal.errors import CameraError, HalTimeoutError, NotConnectedError
+from hal.messages import Intrinsics, RgbdFrame
+
+_PERIOD_S = 1 / 30
+
+
+class ReplayCamera:
+    """Plays frames at the rate they were recorded at, with new stamps and sequence numbers.
+
+    Args:
+        frames: what to play; None = from `path`, or else the built-in scene.
+        path: a file of `save_frames`.
+        clock: by which it plays; None = the wall's.
+        loop: start again after the last frame, else `wait_for_frame` times out there.
+
+    Raises:
+        CameraError: there is nothing to play, or the frames are not of one camera.
+    """
+
+    def __init__(
+        self,
+        frames: Sequence[RgbdFrame] | None = None,
+        path: str | Path | None = None,
+        clock: Clock | None = None,
+        *,
+        loop: bool = True,
+    ) -> None:
+        if frames is None:
+            frames = load_frames(path) if path is not None else make_demo_frames()
+        if not frames:
+            raise CameraError("there is no frame to play; record at least one with save_frames().")
+        if any(frame.intrinsics != frames[0].intrinsics for frame in frames):
+            raise CameraError("the frames to play have different intrinsics; record one camera at a time.")
+        self._frames = list(frames)
+        self._clock = clock or WallClock()
+        self._loop = loop
+        # Due times from the recorded stamps; the last frame lasts as long as the median one.
+        steps = np.diff([frame.stamp_s for frame in frames])
+        self._length_s = float(np.median(steps)) if len(steps) and np.median(steps) > 0 else _PERIOD_S
+        self._due_s = np.array([frame.stamp_s - frames[0].stamp_s for frame in frames])
+        self._length_s += float(self._due_s[-1])
+        self._start_s: float | None = None
+        self._last = -1
+
+    def connect(self) -> None:
+        if self._start_s is None:
+            self._start_s = self._clock.now_s()
+            self._last = -1
+
+    def disconnect(self) -> None:
+        self._start_s = None
+
+    @property
+    def intrinsics(self) -> Intrinsics:
+        self._started()
+        return self._frames[0].intrinsics
+
+    def wait_for_frame(self, timeout_s: float) -> RgbdFrame:
+        start_s = self._started()
+        now_s = self._clock.now_s()
+        sequence = max(self._next_after(now_s - start_s), self._last + 1)
+        loops, index = divmod(sequence, len(self._frames))
+        due_s = start_s + loops * self._length_s + float(self._due_s[index])
+        over = not self._loop and loops > 0
+        if over or due_s > now_s + timeout_s:
+            self._clock.sleep_until(now_s + timeout_s)
+            why = "the recording has ended" if over else f"the next is due in {due_s - now_s:.3f} s"
+            raise HalTimeoutError(f"no frame within {timeout_s} s: {why}.")
+        self._clock.sleep_until(due_s)
+        self._last = sequence
+        return replace(self._frames[index], stamp_s=due_s, sequence=sequence)
+
+    def _started(self) -> float:
+        if self._start_s is None:
+            raise NotConnectedError("the replay camera")
+        return self._start_s
+
+    def _next_after(self, played_s: float) -> int:
+        loops, rest_s = divmod(played_s, self._length_s)
+        index = int(np.searchsorted(self._due_s, rest_s, side="left"))
+        return int(loops) * len(self._frames) + index
+
+
+def save_frames(path: str | Path, frames: Sequence[RgbdFrame]) -> None:
+    """Write frames of one camera into a compressed `.npz`.
+
+    Raises:
+        CameraError: there is none, or they are not of one camera.
+    """
+    if not frames or any(frame.intrinsics != frames[0].intrinsics for frame in frames):
+        raise CameraError("save_frames() takes at least one frame, all of the same intrinsics.")
+    arrays = {
+        "colour": np.stack([frame.colour for frame in frames]),
+        "depth_m": np.stack([frame.depth_m for frame in frames]),
+        "stamp_s": np.array([frame.stamp_s for frame in frames]),
+        "sequence": np.array([frame.sequence for frame in frames]),
+    }
+    masks = [frame.truth_mask for frame in frames]
+    if all(mask is not None for mask in masks):
+        arrays["truth_mask"] = np.stack([np.asarray(mask) for mask in masks])
+    arrays |= {f"intrinsics_{name}": np.array(value) for name, value in asdict(frames[0].intrinsics).items()}
+    with Path(path).open("wb") as file:
+        np.savez_compressed(file, allow_pickle=False, **arrays)
+
+
+def load_frames(path: str | Path) -> list[RgbdFrame]:
+    """Read what `save_frames` wrote.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        CameraError: it holds no frames.
+    """
+    try:
+        with np.load(Path(path), allow_pickle=False) as data:
+            arrays = {name: data[name] for name in data.files}
+        intrinsics = Intrinsics(
+            width=int(arrays["intrinsics_width"]),
+            height=int(arrays["intrinsics_height"]),
+            **{name: float(arrays[f"intrinsics_{name}"]) for name in ("fx", "fy", "cx", "cy")},
+        )
+        masks = arrays.get("truth_mask")
+        return [
+            RgbdFrame(
+                colour=colour,
+                depth_m=arrays["depth_m"][i],
+                intrinsics=intrinsics,
+                stamp_s=float(arrays["stamp_s"][i]),
+                sequence=int(arrays["sequence"][i]),
+                truth_mask=None if masks is None else masks[i],
+            )
+            for i, colour in enumerate(arrays["colour"])
+        ]
+    except (KeyError, ValueError, AttributeError) as error:
+        raise CameraError(f"{path} holds no recorded frames ({error}); write it with save_frames().") from error
+
+
+def make_demo_frames(n: int = 4) -> list[RgbdFrame]:
+    """Return `n` small frames of a ball above a plane, moving sideways, by ray casting."""
+    intrinsics = Intrinsics(width=64, height=48, fx=60.0, fy=60.0, cx=31.5, cy=23.5)
+    rows, columns = np.mgrid[0:48, 0:64]
+    rays = np.dstack([(columns - 31.5) / 60.0, (rows - 23.5) / 60.0, np.ones((48, 64))])
+    frames = []
+    for i in range(n):
+        centre = np.array([0.02 * (i - (n - 1) / 2), 0.0, 0.35])
+        b = rays @ centre
+        a = (rays**2).sum(axis=2)
+        root = b**2 - a * (centre @ centre - 0.05**2)
+        hit = root > 0
+        depth_m = np.where(hit, (b - np.sqrt(np.maximum(root, 0))) / a, 0.5)
+        colour = np.where(hit[..., None], (200, 60, 40), (120, 120, 120))
+        frames.append(
+            RgbdFrame(
+                colour=colour.astype(np.uint8),
+                depth_m=np.round(depth_m, 4),
+                intrinsics=intrinsics,
+                stamp_s=i * _PERIOD_S,
+                sequence=i,
+            )
+        )
+    return frames

@@ -1,0 +1,90 @@
+"""How the servo comes to rest, and how it joins one motion to the next, without a jump."""
+
+from __future__ import annotations
+
+import numpy as np
+from ruckig import ControlInterface, InputParameter, Ruckig, Synchronization, Trajectory
+
+from hal.limits import ServoLimits
+from hal.z1 import N_JOINTS
+
+_HARDER = 1.25
+_ATTEMPTS = 10
+
+
+class Brake:
+    """Plans jerk-limited stops with Ruckig's velocity interface."""
+
+    def __init__(self, limits: ServoLimits) -> None:
+        self._limits = limits
+        self._ruckig = Ruckig(N_JOINTS)
+        self._input = InputParameter(N_JOINTS)
+        self._input.control_interface = ControlInterface.Velocity
+        # Every joint stops as soon as it can; none is stretched to the slowest one's time.
+        self._input.synchronization = Synchronization.No
+        self._input.target_velocity = [0.0] * N_JOINTS
+        self._input.target_acceleration = [0.0] * N_JOINTS
+
+    def plan(self, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> StopPath:
+        """Return the stop from `q`, `dq`, `ddq` (7,) [rad, rad/s, rad/s²].
+
+        Acceleration and jerk are the limits' for every joint that comes to rest in time and inside its position
+        limits with them (Ruckig ignores `max_position`, so the extrema are checked here); a joint that does not
+        brakes harder, in steps of 25 %, up to nine times as hard.
+        """
+        limits, inp = self._limits, self._input
+        inp.current_position = q.tolist()
+        inp.current_velocity = dq.tolist()
+        inp.current_acceleration = np.clip(ddq, -limits.ddq_max, limits.ddq_max).tolist()
+        low, high = np.minimum(limits.q_min, q) - 1e-9, np.maximum(limits.q_max, q) + 1e-9
+        harder = np.ones(N_JOINTS)
+        path = Trajectory(N_JOINTS)
+        for _ in range(_ATTEMPTS):
+            inp.max_acceleration = (harder * limits.ddq_max).tolist()
+            inp.max_jerk = (harder * limits.dddq_max).tolist()
+            self._ruckig.calculate(inp, path)
+            extrema = path.position_extrema
+            late = np.array(path.independent_min_durations) > limits.brake_s
+            outside = np.array([e.min for e in extrema]) < low
+            outside |= np.array([e.max for e in extrema]) > high
+            if not (late | outside).any():
+                break
+            harder[late | outside] *= _HARDER
+        return StopPath(path)
+
+
+class StopPath:
+    """One planned stop."""
+
+    def __init__(self, path: Trajectory) -> None:
+        self._path = path
+        self.duration_s: float = path.duration
+        """How long it takes [s]."""
+
+    def at(self, t_s: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return position and velocity (7,) `t_s` [s] after the stop began."""
+        q, dq, _ = self._path.at_time(min(t_s, self.duration_s))
+        return np.array(q), np.array(dq)
+
+
+class Blend:
+    """A difference in position and velocity that dies out as a cubic within the acceleration limits.
+
+    Added to a motion it makes that motion start where the arm is now.
+    """
+
+    def __init__(self, q: np.ndarray, dq: np.ndarray, ddq_max: np.ndarray) -> None:
+        # The cubic from (q, dq) to rest in T has its largest acceleration at an end: at most 6|q|/T² + 4|dq|/T.
+        v, a = np.abs(dq), ddq_max
+        self.duration_s = float(((4 * v + np.sqrt(16 * v * v + 24 * a * np.abs(q))) / (2 * a)).max())
+        self._q, self._dq = q, dq
+
+    def at(self, t_s: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return what is left of the difference (7,) [rad] and its rate (7,) [rad/s] at `t_s` [s]."""
+        T = self.duration_s
+        if t_s >= T:
+            return np.zeros_like(self._q), np.zeros_like(self._q)
+        s = t_s / T
+        q = (1 - s) ** 2 * ((1 + 2 * s) * self._q + s * T * self._dq)
+        dq = 6 * s * (s - 1) / T * self._q + (3 * s * s - 4 * s + 1) * self._dq
+        return q, dq

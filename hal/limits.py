@@ -1,0 +1,135 @@
+"""What the servo lets through to the arm: joint limits, speed, grip torque, and what counts as blocked."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from typing import NamedTuple
+
+import numpy as np
+
+from hal import z1
+from hal.errors import InvalidMessageError
+from hal.messages import frozen_array
+
+_GRIPPER = z1.N_ARM
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ServoLimits:
+    """Limits of the servo; the defaults are the Z1's (`hal.z1`)."""
+
+    q_min: np.ndarray = field(default_factory=lambda: z1.Q_MIN)
+    """(7,) lowest joint position [rad]."""
+    q_max: np.ndarray = field(default_factory=lambda: z1.Q_MAX)
+    """(7,) highest joint position [rad]."""
+    dq_max: np.ndarray = field(default_factory=lambda: z1.DQ_MAX)
+    """(7,) highest joint speed [rad/s]."""
+    ddq_max: np.ndarray = field(default_factory=lambda: z1.DDQ_MAX)
+    """(7,) joint acceleration used for braking and blending [rad/s²]."""
+    dddq_max: np.ndarray = field(default_factory=lambda: z1.DDDQ_MAX)
+    """(7,) joint jerk used for braking [rad/s³]."""
+    tau_max: np.ndarray = field(default_factory=lambda: z1.TAU_MAX)
+    """(7,) highest motor torque [Nm]."""
+    grip_torque_nm: float = 3.0
+    """The gripper's command leads its measurement by no more than this torque divided by its stiffness [Nm]."""
+    start_error_rad: float = 0.05
+    """How far the first point of a trajectory may be from the arm [rad]."""
+    following_error_rad: float = 0.3
+    """An arm joint further than this from its command is blocked [rad]."""
+    overload_fraction: float = 0.98
+    """A motor above this part of `tau_max` for `overload_s` is overloaded."""
+    overload_s: float = 0.1
+    """See `overload_fraction` [s]."""
+    brake_s: float = 0.38
+    """Braking takes no longer; when `ddq_max` cannot do that, it brakes harder [s]."""
+
+    def __post_init__(self) -> None:
+        for entry in fields(self):
+            value = getattr(self, entry.name)
+            if isinstance(value, (int, float)):
+                if not (np.isfinite(value) and value > 0):
+                    raise InvalidMessageError(f"ServoLimits.{entry.name} is {value}; it must be finite and above 0.")
+            else:
+                object.__setattr__(self, entry.name, frozen_array(value, float, (z1.N_JOINTS,), entry.name))
+        if (self.q_min >= self.q_max).any():
+            raise InvalidMessageError(f"ServoLimits.q_min {self.q_min} must be below q_max {self.q_max}.")
+
+
+class ClippedSetpoint(NamedTuple):
+    """What is left of a wish after the limits."""
+
+    q: np.ndarray
+    """(7,) joint positions [rad]."""
+    dq: np.ndarray
+    """(7,) joint velocities [rad/s]."""
+    clipped: bool
+    """True when an arm joint could not have what was wished (a squeezing gripper is no exception)."""
+
+
+def clip_setpoint(
+    limits: ServoLimits, q: np.ndarray, dq: np.ndarray, q_last: np.ndarray, q_measured: np.ndarray
+) -> ClippedSetpoint:
+    """Return the setpoint nearest to `q` that the arm may have this tick.
+
+    In this order: joint positions; the gripper's lead over its measurement, so that |K_P (q − q_measured)| stays
+    within the grip torque (a grasp squeezes with a bounded force, whatever it was told); the step from `q_last`,
+    so that no joint is ever asked for more than `dq_max`. The step comes last because it protects the motors.
+
+    Args:
+        limits: the limits.
+        q: (7,) wished positions [rad].
+        dq: (7,) wished velocities [rad/s].
+        q_last: (7,) setpoint of the tick before [rad].
+        q_measured: (7,) newest measurement [rad].
+    """
+    allowed = np.minimum(np.maximum(q, limits.q_min), limits.q_max)
+    velocity = np.minimum(np.maximum(dq, -limits.dq_max), limits.dq_max)
+    lead_rad = limits.grip_torque_nm / z1.KP[_GRIPPER]
+    grip = min(max(allowed[_GRIPPER], q_measured[_GRIPPER] - lead_rad), q_measured[_GRIPPER] + lead_rad)
+    if grip != allowed[_GRIPPER]:
+        allowed[_GRIPPER] = grip
+        velocity[_GRIPPER] = 0.0
+    step = limits.dq_max * z1.CONTROL_PERIOD_S
+    allowed = np.minimum(np.maximum(allowed, q_last - step), q_last + step)
+    clipped = bool((np.abs(allowed - q)[:_GRIPPER] > 1e-9).any())
+    return ClippedSetpoint(allowed, velocity, clipped)
+
+
+def find_blocked(limits: ServoLimits, q_command: np.ndarray, q_measured: np.ndarray) -> str:
+    """Say which arm joint does not follow its command; empty when all do."""
+    error = np.abs(q_command - q_measured)[:_GRIPPER]
+    if error.max() <= limits.following_error_rad:
+        return ""
+    worst = int(error.argmax())
+    return (
+        f"{z1.JOINT_NAMES[worst]} is {error[worst]:.2f} rad from its command (allowed "
+        f"{limits.following_error_rad:.2f}): it is blocked or has hit something"
+    )
+
+
+class OverloadWatch:
+    """Counts how long a motor has been at its torque limit."""
+
+    def __init__(self, limits: ServoLimits) -> None:
+        self._level = limits.overload_fraction * limits.tau_max[:_GRIPPER]
+        self._allowed_ticks = round(limits.overload_s / z1.CONTROL_PERIOD_S)
+        self._ticks = np.zeros(_GRIPPER, dtype=int)
+
+    def update(self, tau: np.ndarray) -> str:
+        """Take the torques (7,) [Nm] of this tick; say which arm joint is overloaded, empty when none is.
+
+        The gripper is left out: it is meant to push for as long as it holds something.
+        """
+        over = np.abs(tau[:_GRIPPER]) >= self._level
+        if not over.any():
+            self._ticks[:] = 0
+            return ""
+        self._ticks += 1
+        self._ticks *= over
+        worst = int(self._ticks.argmax())
+        if self._ticks[worst] <= self._allowed_ticks:
+            return ""
+        return (
+            f"{z1.JOINT_NAMES[worst]} has been at its torque limit ({tau[worst]:.1f} Nm) for more than "
+            f"{self._allowed_ticks * z1.CONTROL_PERIOD_S:.2f} s"
+        )

@@ -1,0 +1,43 @@
+"""How evenly the servo ticks."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hal.z1 import CONTROL_PERIOD_S
+
+
+class PeriodStatistics:
+    """A ring of the last measured periods; recording allocates nothing, percentiles are computed on request."""
+
+    def __init__(self, capacity: int = 30_000) -> None:
+        self._ring_s = np.zeros(capacity)
+        self._filled = 0
+        self._next = 0
+        self._last_s: float | None = None
+        self.ticks = 0
+        """Cycles since the start."""
+        self.overruns = 0
+        """Cycles that began more than half a period late."""
+        self.measured = False
+        """True while a thread on the wall clock ticks; in lock-step a period says nothing about the machine."""
+
+    def record(self, now_s: float) -> None:
+        """A cycle began at `now_s` [s]."""
+        self.ticks += 1
+        last, self._last_s = self._last_s, now_s
+        if last is None:
+            return
+        period_s = now_s - last
+        if period_s > 1.5 * CONTROL_PERIOD_S:
+            self.overruns += 1
+        if self.measured:
+            self._ring_s[self._next] = period_s
+            self._next = (self._next + 1) % len(self._ring_s)
+            self._filled = min(self._filled + 1, len(self._ring_s))
+
+    def percentiles_ms(self, *percents: float) -> list[float]:
+        """Return the percentiles of the recorded periods [ms]; zeros while nothing is recorded."""
+        if not self._filled:
+            return [0.0] * len(percents)
+        return (1e3 * np.percentile(self._ring_s[: self._filled], percents)).tolist()
