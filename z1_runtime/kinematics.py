@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-import pinocchio as pin
+import pinocchio as pin  # pyright: ignore[reportMissingImports] - a .pth file leads to it
 
 from hal import z1
 from z1_runtime.se3 import check_pose, error_twist, inverse, pose_error
@@ -32,7 +32,7 @@ _SEEDS = (
 )
 
 
-class IkFailure(Exception):  # noqa: N818 - a failure of the search, part of the normal course of planning
+class IkFailure(Exception):
     """No joint vector reaches a pose, or a path of poses without a jump.
 
     Attributes:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-import pinocchio as pin
+import pinocchio as pin  # pyright: ignore[reportMissingImports] - a .pth file leads to it
 
 _ORTHONORMAL_ATOL = 1e-6
 """Rotation matrices that went through float32 pass, anything worse is a mistake."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 import ruckig
@@ -18,10 +19,14 @@ DEFAULT_SPEED = 0.5
 """Fraction of the arm's limits a motion uses unless told otherwise."""
 _LIMIT_ATOL = 1e-9  # rounding [rad]
 
+_OVERSHOOT = 1e-6  # of the way; Ruckig's rounding
+
+_ALREADY_THERE = 1e-6  # lines shorter than this are no lines [m, rad]
 _WAYPOINT_SPACING_M = 0.005
 _WAYPOINT_SPACING_RAD = 0.03
 _MIN_WAYPOINTS = 12
 _SPLINE_DEGREE = 5  # continuous jerk
+_BULGE_RAD = 1e-8  # so little over a limit is clipped without a trace in the jerk
 _STRETCH_MARGIN = 1.005  # the peaks between two samples; 1.5 % of the jerk
 
 # At full speed; the Z1's data sheet has no Cartesian figures, these are ours
@@ -29,7 +34,7 @@ _FULL_LINEAR = (0.5, 2.0, 20.0)
 _FULL_ANGULAR = (2.0, 8.0, 80.0)
 
 
-class PathFailure(Exception):  # noqa: N818 - part of the normal course of planning
+class PathFailure(Exception):
     """A straight motion cannot be done; the message says where along it and why.
 
     Attributes:
@@ -124,19 +129,29 @@ def hold(q: np.ndarray, duration_s: float) -> JointTrajectory:
 
 
 def joint_move(q_start: np.ndarray, q_goal: np.ndarray, limits: MotionLimits | None = None) -> JointTrajectory:
-    """Move from rest at `q_start` (7,) to rest at `q_goal` (7,), straight in joint space (phase-synchronised Ruckig).
+    """Move from rest at `q_start` (7,) to rest at `q_goal` (7,), straight in joint space.
+
+    One Ruckig motion along the segment times all joints: Ruckig's own phase synchronisation leaves the segment where
+    another joint's limit than the slowest one's would bind (seen: 0.15 rad beside it), and a collision check would
+    have looked at the wrong path.
 
     Raises:
         ValueError: a joint vector is outside the limits, or not finite.
     """
     q_start, q_goal = _check_joints(q_start, "q_start"), _check_joints(q_goal, "q_goal")
     limits = limits or MotionLimits()
-    if np.array_equal(q_start, q_goal):
-        return hold(q_goal, 0.0)
-    trajectory = _rest_to_rest(q_start, q_goal, limits.velocity, limits.acceleration, limits.jerk)
-    t_s, q, dq, _, _ = _sample(trajectory)
+    way = q_goal - q_start
+    length_rad = float(np.abs(way).max())
+    if length_rad < _LIMIT_ATOL:
+        motion = hold(q_goal, 0.0)
+        motion.q[0] = q_start
+        return motion
+    direction = way / length_rad
+    per_joint = np.array([limits.velocity, limits.acceleration, limits.jerk]) / np.maximum(np.abs(direction), 1e-12)
+    t_s, along, speed, _, _ = _sample(_rest_to_rest(length_rad, per_joint.min(axis=1)))
+    q = np.clip(q_start + along[:, None] * direction, z1.Q_MIN, z1.Q_MAX)
     q[0], q[-1] = q_start, q_goal
-    return JointTrajectory(t_s=t_s, q=q, dq=dq)
+    return JointTrajectory(t_s=t_s, q=q, dq=speed[:, None] * direction)
 
 
 def joint_path(qs: np.ndarray, limits: MotionLimits | None = None) -> JointTrajectory:
@@ -147,7 +162,7 @@ def joint_path(qs: np.ndarray, limits: MotionLimits | None = None) -> JointTraje
     """
     if len(qs) < 2:
         raise ValueError(f"joint_path was given {len(qs)} points; it needs at least a start and a goal.")
-    return concatenate([joint_move(a, b, limits) for a, b in zip(qs[:-1], qs[1:], strict=True)])
+    return concatenate([joint_move(a, b, limits) for a, b in pairwise(qs)])
 
 
 def gripper_move(q: np.ndarray, jaw_goal: float, limits: MotionLimits | None = None) -> JointTrajectory:
@@ -161,7 +176,7 @@ def gripper_move(q: np.ndarray, jaw_goal: float, limits: MotionLimits | None = N
     return joint_move(q, q_goal, limits)
 
 
-def straight_move(
+def straight_move(  # noqa: PLR0917 - the order of the line itself: from, to, then how
     kinematics: Kinematics,
     T_start: np.ndarray,
     T_goal: np.ndarray,
@@ -193,16 +208,16 @@ def straight_move(
     _check_start(T_from, se3.check_pose(T_start, "T_start"))
 
     length_m, angle_rad = se3.pose_error(T_from, T_goal)
-    if length_m < _LIMIT_ATOL and angle_rad < _LIMIT_ATOL:
+    if length_m < _ALREADY_THERE and angle_rad < _ALREADY_THERE:
         return gripper_move(q_start, jaw_goal, limits)
     spline = _joint_spline(kinematics, T_from, T_goal, q_start, jaw_goal)
     trajectory = _time_along(spline, length_m, angle_rad, limits)
     t_s, s, ds, _, _ = _sample(trajectory)
-    s = np.clip(s[:, 0], 0.0, 1.0)
+    s = np.clip(s, 0.0, 1.0)
     q = spline(s)
-    q[0], q[-1] = q_start, spline(1.0)
+    q[0], q[-1, -1] = q_start, jaw_goal
     _check_inside(q, s)
-    return JointTrajectory(t_s=t_s, q=np.clip(q, z1.Q_MIN, z1.Q_MAX), dq=spline(s, 1) * ds)
+    return JointTrajectory(t_s=t_s, q=np.clip(q, z1.Q_MIN, z1.Q_MAX), dq=spline(s, 1) * ds[:, None])
 
 
 def concatenate(parts: list[JointTrajectory]) -> JointTrajectory:
@@ -213,7 +228,7 @@ def concatenate(parts: list[JointTrajectory]) -> JointTrajectory:
     """
     if not parts:
         raise ValueError("there is nothing to concatenate; give at least one motion.")
-    for before, after in zip(parts[:-1], parts[1:], strict=True):
+    for before, after in pairwise(parts):
         gap = np.abs(after.q[0] - before.q[-1])
         if gap.max() > _LIMIT_ATOL:
             joint = int(gap.argmax())
@@ -226,27 +241,22 @@ def concatenate(parts: list[JointTrajectory]) -> JointTrajectory:
 # --- Timing -----------------------------------------------------------------------------------------------
 
 
-def _rest_to_rest(
-    start: np.ndarray, goal: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray, jerk: np.ndarray
-) -> ruckig.Trajectory:
-    """Return Ruckig's time-optimal motion; all vectors (D,). Its `intermediate_positions` would call a web service."""
-    request = ruckig.InputParameter(len(start))
-    request.current_position, request.target_position = start.tolist(), goal.tolist()
-    request.max_velocity, request.max_acceleration, request.max_jerk = (
-        velocity.tolist(),
-        acceleration.tolist(),
-        jerk.tolist(),
-    )
-    request.synchronization = ruckig.Synchronization.Phase
-    trajectory = ruckig.Trajectory(len(start))
-    result = ruckig.Ruckig(len(start)).calculate(request, trajectory)
+def _rest_to_rest(length: float, fastest: np.ndarray) -> ruckig.Trajectory:
+    """Return Ruckig's time-optimal way from 0 to `length` under `fastest` = (velocity, acceleration, jerk) limits.
+
+    Waypoints are never given to Ruckig: its wheel sends them to a web service.
+    """
+    request = ruckig.InputParameter(1)
+    request.current_position, request.target_position = [0.0], [length]
+    request.max_velocity, request.max_acceleration, request.max_jerk = ([float(limit)] for limit in fastest)
+    trajectory = ruckig.Trajectory(1)
+    result = ruckig.Ruckig(1).calculate(request, trajectory)
     if result != ruckig.Result.Working:
         raise RuntimeError(f"Ruckig returned {result} for {request}")
     # Ruckig takes position limits and ignores them, so what it found is checked here
-    low, high = np.minimum(start, goal) - 1e-6, np.maximum(start, goal) + 1e-6
-    extrema = np.array([(bound.min, bound.max) for bound in trajectory.position_extrema])
-    if (extrema[:, 0] < low).any() or (extrema[:, 1] > high).any():
-        raise RuntimeError(f"Ruckig overshoots between rest and rest: {extrema.tolist()} for {request}")
+    extrema = trajectory.position_extrema[0]
+    if extrema.min < -_OVERSHOOT * length or extrema.max > (1.0 + _OVERSHOOT) * length:
+        raise RuntimeError(f"Ruckig goes from {extrema.min} to {extrema.max} for {request}")
     return trajectory
 
 
@@ -256,16 +266,16 @@ def _sample_times(duration_s: float) -> np.ndarray:
 
 
 def _sample(trajectory: ruckig.Trajectory) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return times (N,), and position, velocity, acceleration and jerk (N, D) at the control period.
+    """Return times, and position, velocity, acceleration and jerk along the way, each (N,), at the control period.
 
     The motion is slowed by less than one period in all, so that the last sample is its end.
     """
     t_s = _sample_times(trajectory.duration)
     pace = trajectory.duration / t_s[-1]
-    samples = np.array([trajectory.at_time(t)[:3] for t in (t_s * pace).tolist()])
+    samples = np.array([trajectory.at_time(t)[:3] for t in (t_s * pace).tolist()])[:, :, 0]
     position, velocity, acceleration = samples[:, 0], samples[:, 1] * pace, samples[:, 2] * pace**2
     velocity[[0, -1]] = 0.0
-    jerk = np.diff(acceleration, axis=0, append=0.0) / z1.CONTROL_PERIOD_S
+    jerk = np.diff(acceleration, append=0.0) / z1.CONTROL_PERIOD_S
     return t_s, position, velocity, acceleration, jerk
 
 
@@ -306,10 +316,11 @@ def _time_along(
     angular = np.array([limits.angular_velocity, limits.angular_acceleration, limits.angular_jerk])
     fastest = np.minimum(per_joint.min(axis=1), linear / max(length_m, _LIMIT_ATOL))
     fastest = np.minimum(fastest, angular / max(angle_rad, _LIMIT_ATOL))
-    trajectory = _rest_to_rest(np.zeros(1), np.ones(1), *fastest[:, None])
+    trajectory = _rest_to_rest(1.0, fastest)
 
-    _, s, ds, dds, ddds = _sample(trajectory)
-    q1, q2, q3 = (spline(np.clip(s[:, 0], 0.0, 1.0), order) for order in (1, 2, 3))
+    _, s, *rates = _sample(trajectory)
+    ds, dds, ddds = (rate[:, None] for rate in rates)
+    q1, q2, q3 = (spline(np.clip(s, 0.0, 1.0), order) for order in (1, 2, 3))
     velocity = np.abs(q1 * ds / limits.velocity).max()
     acceleration = np.abs((q1 * dds + q2 * ds**2) / limits.acceleration).max()
     jerk = np.abs((q1 * ddds + 3.0 * q2 * ds * dds + q3 * ds**3) / limits.jerk).max()
@@ -317,7 +328,7 @@ def _time_along(
     if stretch <= 1.0:
         return trajectory
     # s(t / stretch) has its n-th derivative divided by stretchⁿ, and so have the joints
-    return _rest_to_rest(np.zeros(1), np.ones(1), *(fastest / stretch ** np.arange(1, 4))[:, None])
+    return _rest_to_rest(1.0, fastest / stretch ** np.arange(1, 4))
 
 
 # --- Checks -----------------------------------------------------------------------------------------------
@@ -346,7 +357,7 @@ def _check_inside(q: np.ndarray, s: np.ndarray) -> None:
     """Refuse a spline that bulges over a limit between two waypoints that are inside."""
     excess = np.maximum(z1.Q_MIN - q, q - z1.Q_MAX)
     row, joint = np.unravel_index(int(excess.argmax()), excess.shape)
-    if excess[row, joint] > 1e-6:
+    if excess[row, joint] > _BULGE_RAD:
         raise PathFailure(
             f"{z1.JOINT_NAMES[joint]} would be {q[row, joint]:.4f} rad at {100 * s[row]:.0f} % of the straight line; "
             f"allowed is {z1.Q_MIN[joint]:.4f} to {z1.Q_MAX[joint]:.4f} rad.",
