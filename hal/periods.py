@@ -6,6 +6,8 @@ import numpy as np
 
 from hal.z1 import CONTROL_PERIOD_S
 
+_SUMMARY_TICKS = 500
+
 
 class PeriodStatistics:
     """A ring of the last measured periods; recording allocates nothing, percentiles are computed on request."""
@@ -15,6 +17,8 @@ class PeriodStatistics:
         self._filled = 0
         self._next = 0
         self._last_s: float | None = None
+        self._summary_ms = (0.0, 0.0)
+        self._due_ticks = 0
         self.ticks = 0
         """Cycles since the start."""
         self.overruns = 0
@@ -36,8 +40,14 @@ class PeriodStatistics:
             self._next = (self._next + 1) % len(self._ring_s)
             self._filled = min(self._filled + 1, len(self._ring_s))
 
-    def percentiles_ms(self, *percents: float) -> list[float]:
-        """Return the percentiles of the recorded periods [ms]; zeros while nothing is recorded."""
-        if not self._filled:
-            return [0.0] * len(percents)
-        return (1e3 * np.percentile(self._ring_s[: self._filled], percents)).tolist()
+    def summary_ms(self) -> tuple[float, float]:
+        """Return median and 99.9th percentile of the recorded periods [ms]; zeros while nothing is recorded.
+
+        Sorting the ring takes the interpreter from the tick for about a millisecond, so the answer is kept for
+        `_SUMMARY_TICKS`.
+        """
+        if self._filled and self.ticks >= self._due_ticks:
+            self._due_ticks = self.ticks + _SUMMARY_TICKS
+            p50, p999 = np.percentile(self._ring_s[: self._filled], [50, 99.9])
+            self._summary_ms = (1e3 * float(p50), 1e3 * float(p999))
+        return self._summary_ms

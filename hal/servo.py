@@ -263,7 +263,7 @@ class Servo:
         snapshot = self._connected()
         now_s = self.clock.now_s()
         self._tell_clips(now_s)
-        p50, p999 = self.periods.percentiles_ms(50, 99.9)
+        p50, p999 = self.periods.summary_ms()
         current = self._playback
         buffered_s = 0.0
         if current is not None and current.trajectory_id > self._done_id:
@@ -363,6 +363,9 @@ class Servo:
             self._rearmed = self._link_lost = False
             self._reason = ""
             self._give_way = True
+        if self._done_id > self._trajectory_id:  # cancelled before its first tick
+            self._trajectory_id, self._time_s, self._finished = self._done_id, 0.0, False
+            self._reason = self._cancel_reason
         current, target = self._playback, self._target
         playing = current is not None and current.trajectory_id > self._done_id and not self._latch
         if playing and current is not None:

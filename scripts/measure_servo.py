@@ -1,0 +1,170 @@
+"""Measure how evenly the 500 Hz servo ticks on this machine, beside a bare C loop under the same load.
+
+    python -m scripts.measure_servo --seconds 20
+
+The servo (with the mock arm) and the bare loop run at the same time, each in its own process, so that both meet the
+same stalls, and both ask for SCHED_FIFO. The bare loop is C, compiled with `cc`; without a compiler it is libc's clock_nanosleep called by ctypes.
+The aim: the servo's p99.9 is at most 1.3 times the bare loop's.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import shutil
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import tyro
+
+from hal.backends.mock_arm import MockArm
+from hal.clock import Stopwatch, WallClock
+from hal.messages import TrajectoryChunk
+from hal.servo import Servo, ServoThread
+from hal.z1 import CONTROL_PERIOD_S, N_JOINTS, Q_MAX, Q_MIN
+
+_BARE_C = r"""
+#include <sched.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <time.h>
+int main(int argc, char **argv) {
+    long n = atol(argv[1]), period = atol(argv[2]);
+    double *out = malloc(n * sizeof *out);
+    struct timespec due, now;
+    struct sched_param priority = { .sched_priority = 80 };
+    sched_setscheduler(0, SCHED_FIFO, &priority);  // as the servo does; goes on without the right
+    clock_gettime(CLOCK_MONOTONIC, &due);
+    for (long i = 0; i < n; i++) {
+        due.tv_nsec += period;
+        if (due.tv_nsec >= 1000000000L) { due.tv_nsec -= 1000000000L; due.tv_sec++; }
+        clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &due, NULL);
+        clock_gettime(CLOCK_MONOTONIC, &now);
+        out[i] = now.tv_sec + 1e-9 * now.tv_nsec;
+        if (now.tv_sec > due.tv_sec || (now.tv_sec == due.tv_sec && now.tv_nsec - due.tv_nsec > period / 2)) due = now;
+    }
+    fwrite(out, sizeof *out, n, stdout);
+    return 0;
+}
+"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """What to measure."""
+
+    seconds: float = 20.0
+    """How long [s]."""
+
+
+def main(options: Options) -> None:
+    """Run both loops and print their periods."""
+    n = round(options.seconds / CONTROL_PERIOD_S)
+    with tempfile.TemporaryDirectory() as folder:
+        command, kind = _bare_command(Path(folder), n)
+        with subprocess.Popen(command, stdout=subprocess.PIPE) as bare:
+            servo_ms, cost_us, overruns = _run_servo(options.seconds)
+            assert bare.stdout is not None
+            bare_ms = 1e3 * np.diff(np.frombuffer(bare.stdout.read()))
+    print(f"period [ms]         p50     p99   p99.9     max  late by more than half a period   ({kind})")
+    for name, periods in (("bare loop", bare_ms), ("servo", servo_ms)):
+        figures = " ".join(f"{x:7.3f}" for x in (*np.percentile(periods, [50, 99, 99.9]), periods.max()))
+        print(f"{name:15s} {figures}  {(periods > 1.5e3 * CONTROL_PERIOD_S).sum()} of {len(periods)}")
+    print(f"servo: {overruns} overruns counted; a tick costs p50 {cost_us[0]:.0f} us, p99 {cost_us[1]:.0f} us")
+    ratio = np.percentile(servo_ms, 99.9) / np.percentile(bare_ms, 99.9)
+    print(f"p99.9 of the servo is {ratio:.2f} times the bare loop's (aim: 1.3 or less)")
+
+
+def _bare_command(folder: Path, n: int) -> tuple[list[str], str]:
+    period_ns = str(round(1e9 * CONTROL_PERIOD_S))
+    if compiler := shutil.which("cc"):
+        source, program = folder / "bare.c", folder / "bare"
+        source.write_text(_BARE_C)
+        subprocess.run([compiler, "-O2", "-o", str(program), str(source)], check=True)
+        return [str(program), str(n), period_ns], "C"
+    return [sys.executable, "-c", "from scripts.measure_servo import *; run_bare_python()", str(n)], "libc by ctypes"
+
+
+def run_bare_python() -> None:
+    """Do what the C loop does, with libc's clock_nanosleep, and write the wake-up times to stdout."""
+    n = int(sys.argv[1])
+    clock, sleep_until = WallClock(), _make_nanosleep()
+    times, due_s = np.zeros(n), clock.now_s()
+    for i in range(n):
+        due_s += CONTROL_PERIOD_S
+        sleep_until(due_s)
+        times[i] = clock.now_s()
+        if times[i] - due_s > CONTROL_PERIOD_S / 2:
+            due_s = times[i]
+    sys.stdout.buffer.write(times.tobytes())
+
+
+def _make_nanosleep(): -> Callable[[float], None]
+    class Timespec(ctypes.Structure):
+        _fields_ = (("sec", ctypes.c_long), ("nsec", ctypes.c_long))
+
+    libc = ctypes.CDLL(None)
+
+    def sleep_until(t_s: float) -> None:
+        due = Timespec(int(t_s), int(1e9 * (t_s % 1.0)))
+        libc.clock_nanosleep(1, 1, ctypes.byref(due), None)  # CLOCK_MONOTONIC, TIMER_ABSTIME
+
+    return sleep_until
+
+
+class _TimedServo(Servo):
+    """A servo that keeps its wake-up times and what each tick costs."""
+
+    def __init__(self, arm: MockArm, clock: WallClock, capacity: int) -> None:
+        super().__init__(arm, clock)
+        self.woke_s, self.cost_ms, self.count = np.zeros(capacity), np.zeros(capacity), 0
+
+    def tick(self) -> None:
+        i = self.count % len(self.woke_s)
+        self.woke_s[i] = self.clock.now_s()
+        watch = Stopwatch()
+        super().tick()
+        self.cost_ms[i] = watch.lap_ms()
+        self.count += 1
+
+
+def _run_servo(seconds: float) -> tuple[np.ndarray, list[float], int]:
+    """Return the periods [ms], the cost of a tick (p50, p99) [us] and the overruns, of a servo that is moving."""
+    clock = WallClock()
+    servo = _TimedServo(MockArm(clock, q=(Q_MIN + Q_MAX) / 2), clock, round(1.2 * seconds / CONTROL_PERIOD_S))
+    servo.connect()
+    servo.claim("measure_servo")
+    ended = threading.Event()
+    with ServoThread(servo, clock):
+        sender = threading.Thread(target=_swing, args=(servo, ended), daemon=True)
+        sender.start()
+        clock.sleep_until(clock.now_s() + seconds)
+        ended.set()
+        sender.join()
+        overruns = servo.status().overruns
+    servo.disconnect()
+    woke_s, cost_ms = servo.woke_s[: servo.count], servo.cost_ms[: servo.count]
+    return 1e3 * np.diff(woke_s), (1e3 * np.percentile(cost_ms, [50, 99])).tolist(), overruns
+
+
+def _swing(servo: Servo, ended: threading.Event) -> None:
+    """Stream a gentle swing of all joints in chunks of 0.1 s, about 0.2 s ahead, until `ended`."""
+    centre = servo.read_state().q
+    start_s, sent_s = servo.clock.now_s(), 0.0
+    while not ended.is_set():
+        t_s = sent_s + np.linspace(0, 0.1, 6)
+        angle = 0.2 * (1 - np.cos(t_s))
+        q = centre + angle[:, None] * np.ones(N_JOINTS)
+        dq = (0.2 * np.sin(t_s))[:, None] * np.ones(N_JOINTS)
+        servo.stream(TrajectoryChunk(trajectory_id=1, t_s=t_s, q=q, dq=dq))
+        sent_s += 0.1
+        servo.clock.sleep_until(start_s + sent_s - 0.2)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options, description=__doc__))
