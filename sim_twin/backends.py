@@ -1,0 +1,222 @@
+"""The twin's arm and camera behind the contracts of `hal`, in this process.
+
+Lock-step: the clock is a `TwinClock`, physics moves only when somebody sleeps on it, and an episode is a pure function
+of its seed. Real time: the clock is the wall's, and the 500 Hz servo that reads the arm's state drives the physics.
+"""
+
+from __future__ import annotations
+
+import math
+from concurrent.futures import ThreadPoolExecutor
+
+import mujoco
+import numpy as np
+
+from hal import z1
+from hal.clock import Clock, WallClock
+from hal.errors import HalTimeoutError, NotConnectedError
+from hal.messages import ArmSetpoint, ArmState, Intrinsics, RgbdFrame
+from hal.rig import Rig
+from sim_twin import d405
+from sim_twin.clock import TwinClock
+from sim_twin.render import View, WristRenderer, make_renderer
+from sim_twin.scene import SceneConfig
+from sim_twin.world import World
+
+_MAX_CATCH_UP_S = 0.020
+"""Most simulated time one read may make up; the rest of a delay is dropped, so the world slows and never bursts."""
+
+
+class TwinArm:
+    """`hal.arm.Arm` of the simulated Z1; moves between threads as the world does (under its lock).
+
+    Args:
+        world: whose arm it is; by default one of its own with the default scene.
+        clock: a `TwinClock` of that world for lock-step (the default), any other for real time.
+    """
+
+    def __init__(self, world: World | None = None, clock: Clock | None = None) -> None:
+        self.world = world if world is not None else World(SceneConfig())
+        self.clock: Clock = clock if clock is not None else TwinClock(self.world)
+        self._lockstep = isinstance(self.clock, TwinClock)
+        self._connected = False
+        self._offset_s = 0.0  # clock minus world
+
+    def connect(self) -> None:
+        """Start; the arm holds still."""
+        self._offset_s = 0.0 if self._lockstep else self.clock.now_s() - self.world.time_s
+        self._connected = True
+
+    def disconnect(self) -> None:
+        """Leave; the arm holds where it is."""
+        if self._connected:
+            self.stop()
+        self._connected = False
+
+    def read_state(self) -> ArmState:
+        """Return the measurement of this moment; in real time the world is first brought up to it.
+
+        Raises:
+            NotConnectedError: before `connect()`.
+        """
+        self._require_connection()
+        if not self._lockstep:
+            self._catch_up()
+        q, dq, tau = self.world.read_arm()
+        return ArmState(stamp_s=self.world.time_s + self._offset_s, q=q, dq=dq, tau=tau)
+
+    def send(self, setpoint: ArmSetpoint) -> ArmSetpoint:
+        """Set the servos' targets, positions and speeds clamped to the URDF's limits as the vendor's LOWCMD does.
+
+        Raises:
+            NotConnectedError: before `connect()`.
+        """
+        self._require_connection()
+        q = np.clip(setpoint.q, z1.Q_MIN, z1.Q_MAX)
+        dq = np.clip(setpoint.dq, -z1.DQ_MAX, z1.DQ_MAX)
+        self.world.set_command(q, dq)
+        return ArmSetpoint(q=q, dq=dq)
+
+    def stop(self) -> None:
+        """Hold the position measured now."""
+        q, _, _ = self.world.read_arm()
+        self.world.set_command(np.clip(q, z1.Q_MIN, z1.Q_MAX), np.zeros(z1.N_JOINTS))
+
+    def _catch_up(self) -> None:
+        late_s = self.clock.now_s() - self._offset_s - self.world.time_s
+        self._offset_s += max(late_s - _MAX_CATCH_UP_S, 0.0)
+        # Whole periods only, so that no read runs ahead of the clock.
+        due = math.floor(min(late_s, _MAX_CATCH_UP_S) / z1.CONTROL_PERIOD_S + 1e-6)
+        for _ in range(due):
+            self.world.step()
+
+    def _require_connection(self) -> None:
+        if not self._connected:
+            raise NotConnectedError("the twin's arm")
+
+
+class TwinCamera:
+    """`hal.camera.Camera` of the simulated D405: 640×480 at 30 Hz, with the object's exact mask.
+
+    Drawing happens in a thread of its own, as an OpenGL context belongs to one thread.
+
+    Args:
+        world: what it looks at; by default one of its own with the default scene.
+        clock: a `TwinClock` of that world for lock-step (the default), any other for real time.
+        renderer: one of `sim_twin.render.RENDERERS`; by default what the environment says.
+    """
+
+    def __init__(self, world: World | None = None, clock: Clock | None = None, renderer: str | None = None) -> None:
+        self.world = world if world is not None else World(SceneConfig())
+        self.clock: Clock = clock if clock is not None else TwinClock(self.world)
+        self._kind = renderer
+        self._thread: ThreadPoolExecutor | None = None
+        self._renderer: WristRenderer | None = None
+        self._snapshot = mujoco.MjData(self.world.model)
+        self._first_s = 0.0
+        self._sequence = 0
+
+    def connect(self) -> None:
+        """Open the renderer and draw once, so that the first frame is as quick as the others.
+
+        Raises:
+            CameraError: the renderer asked for cannot be had.
+        """
+        if self._thread is not None:
+            return
+        thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="twin-camera")
+        try:
+            self._renderer = thread.submit(make_renderer, self.world.model, d405.INTRINSICS, self._kind).result()
+            self._thread = thread
+            self._expose(self._draw(), sequence=0)
+        except BaseException:
+            self._thread = thread
+            self.disconnect()
+            raise
+        self._first_s, self._sequence = self.clock.now_s(), 0
+
+    def disconnect(self) -> None:
+        """Free the renderer."""
+        thread, renderer = self._thread, self._renderer
+        self._thread = self._renderer = None
+        if thread is not None:
+            if renderer is not None:
+                thread.submit(renderer.close).result()
+            thread.shutdown()
+
+    @property
+    def intrinsics(self) -> Intrinsics:
+        """Of both images.
+
+        Raises:
+            NotConnectedError: before `connect()`.
+        """
+        self._require_connection()
+        return d405.INTRINSICS
+
+    def wait_for_frame(self, timeout_s: float) -> RgbdFrame:
+        """Wait for the next of the camera's instants, 30 a second, and return what is seen then.
+
+        Raises:
+            NotConnectedError: before `connect()`.
+            HalTimeoutError: that instant is more than `timeout_s` [s] away.
+        """
+        self._require_connection()
+        now_s = self.clock.now_s()
+        # The tolerance keeps an instant that rounding puts a hair after its own step from being seen twice.
+        number = math.floor((now_s - self._first_s) / d405.FRAME_PERIOD_S + 1e-6) + 1
+        due_s = self._first_s + number * d405.FRAME_PERIOD_S
+        if due_s > now_s + timeout_s:
+            self.clock.sleep_until(now_s + timeout_s)
+            raise HalTimeoutError(
+                f"no frame within {timeout_s:g} s; the twin's camera gives 30 a second: wait at least 0.04 s."
+            )
+        self.clock.sleep_until(due_s)
+        stamp_s = self.clock.now_s()
+        view = self._draw()
+        self._sequence += 1
+        colour, depth_m = self._expose(view, self._sequence)
+        return RgbdFrame(
+            colour=colour,
+            depth_m=depth_m,
+            intrinsics=d405.INTRINSICS,
+            stamp_s=stamp_s,
+            sequence=self._sequence,
+            truth_mask=view.mask,
+        )
+
+    def _draw(self) -> View:
+        thread, renderer = self._thread, self._renderer
+        if thread is None or renderer is None:
+            raise NotConnectedError("the twin's camera")
+        return thread.submit(lambda: renderer.render(self.world.snapshot(self._snapshot))).result()
+
+    def _expose(self, view: View, sequence: int) -> tuple[np.ndarray, np.ndarray]:
+        config = self.world.config
+        if not config.noise:
+            return view.colour, d405.round_depth(view.z_m)
+        colour = d405.measure_colour(view.colour, config.seed, sequence)
+        return colour, d405.measure_depth(view.z_m, config.seed, sequence)
+
+    def _require_connection(self) -> None:
+        if self._thread is None:
+            raise NotConnectedError("the twin's camera")
+
+
+def make_rig(scene: SceneConfig | None = None, lockstep: bool = False) -> Rig:
+    """Return arm, camera and clock of one new world, not yet connected.
+
+    Args:
+        scene: what stands on the table; the default scene if None.
+        lockstep: True for the twin's own clock, False for the wall's.
+    """
+    world = World(scene if scene is not None else SceneConfig())
+    twin_clock = TwinClock(world)
+    clock: Clock = twin_clock if lockstep else WallClock()
+    return Rig(
+        arm=TwinArm(world, clock),
+        camera=TwinCamera(world, clock),
+        clock=clock,
+        call_every_tick=twin_clock.call_every_tick if lockstep else None,
+        world=world,
+    )

@@ -1,0 +1,175 @@
+"""What the wrist camera would see without its flaws: colour, exact depth and the object's exact mask.
+
+Two ways: OpenGL through EGL, or, where there is none, ray casting.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+from dataclasses import dataclass
+from typing import Protocol
+
+import mujoco
+import numpy as np
+
+from hal.errors import CameraError
+from hal.messages import Intrinsics
+from sim_twin.objects import OBJECT_BODY
+from sim_twin.z1_mjcf import GROUP_ARM, GROUP_SCENE
+
+logger = logging.getLogger(__name__)
+
+RENDER_VARIABLE = "Z1_TWIN_RENDER"
+"""Environment variable that forces `egl` or `rays`; unset or `auto` takes the first that works."""
+RENDERERS = ("auto", "egl", "rays")
+
+_NEAR_M, _FAR_M = 0.01, 20.0
+_warned = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class View:
+    """One exact image."""
+
+    colour: np.ndarray
+    """(H, W, 3) uint8, RGB."""
+    z_m: np.ndarray
+    """(H, W) float32 distance along the optical axis [m]; 0 where nothing is hit."""
+    mask: np.ndarray
+    """(H, W) bool, the object's pixels."""
+
+
+class WristRenderer(Protocol):
+    """Draws for the wrist camera; belongs to the thread that made it."""
+
+    def render(self, data: mujoco.MjData) -> View:
+        """Draw the state `data` (kinematics computed)."""
+        ...
+
+    def close(self) -> None:
+        """Free what the renderer holds."""
+        ...
+
+
+def make_renderer(model: mujoco.MjModel, intrinsics: Intrinsics, kind: str | None = None) -> WristRenderer:
+    """Return a renderer for the calling thread.
+
+    Args:
+        model: the scene.
+        intrinsics: of the wrist camera.
+        kind: one of `RENDERERS`; by default what the environment variable says.
+
+    Raises:
+        ValueError: no such kind.
+        CameraError: EGL was asked for and there is none.
+    """
+    global _warned  # noqa: PLW0603 - one warning per process
+    kind = kind or os.environ.get(RENDER_VARIABLE, "auto")
+    if kind not in RENDERERS:
+        raise ValueError(f"renderer is {kind!r}; set {RENDER_VARIABLE} to one of: {', '.join(RENDERERS)}.")
+    if kind != "rays":
+        try:
+            return EglRenderer(model, intrinsics)
+        except (ImportError, AttributeError, RuntimeError) as error:
+            if kind == "egl":
+                raise CameraError(f"no OpenGL through EGL here ({error}); install libegl1 or unset it.") from error
+            if not _warned:
+                _warned = True
+                logger.warning("No OpenGL through EGL (%s): the twin's camera casts rays, with flat colours.", error)
+    from sim_twin.rays import RayRenderer
+
+    return RayRenderer(model, intrinsics)
+
+
+def camera_id(model: mujoco.MjModel) -> int:
+    """Return the number of the wrist camera."""
+    return model.camera("wrist").id
+
+
+def object_geoms(model: mujoco.MjModel) -> np.ndarray:
+    """Return which geoms (ngeom,) bool are the object's."""
+    return model.geom_bodyid == model.body(OBJECT_BODY).id
+
+
+class EglRenderer:
+    """Two passes on one framebuffer of the camera's size: geom numbers with depth, then colour."""
+
+    def __init__(self, model: mujoco.MjModel, intrinsics: Intrinsics) -> None:
+        from mujoco.egl import GLContext
+
+        self._model, self._intrinsics = model, intrinsics
+        width, height = intrinsics.width, intrinsics.height
+        self._gl = GLContext(width, height)
+        self._gl.make_current()
+        self._context = make_context(model, width, height, samples=0)
+        self._context.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR.value
+        self._scene = mujoco.MjvScene(model, maxgeom=500)
+        self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = False
+        self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
+        self._option = mujoco.MjvOption()
+        self._option.geomgroup[:] = 0
+        self._option.geomgroup[[GROUP_SCENE, GROUP_ARM]] = 1
+        self._camera = mujoco.MjvCamera()
+        self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED.value
+        self._camera.fixedcamid = camera_id(model)
+        self._rect = mujoco.MjrRect(0, 0, width, height)
+        self._is_object = object_geoms(model)
+        self._ids = np.empty((height, width, 3), np.uint8)
+        self._inverse_z = np.empty((height, width), np.float32)
+
+    def render(self, data: mujoco.MjData) -> View:
+        """Draw the state `data` (kinematics computed)."""
+        self._gl.make_current()
+        category = mujoco.mjtCatBit.mjCAT_ALL.value
+        mujoco.mjv_updateScene(self._model, data, self._option, None, self._camera, category, self._scene)
+        self._set_frustum()
+        z_m, mask = self._draw_depth_and_mask()
+        colour = np.empty_like(self._ids)
+        mujoco.mjr_render(self._rect, self._scene, self._context)
+        mujoco.mjr_readPixels(colour, None, self._rect, self._context)
+        return View(colour=np.ascontiguousarray(colour[::-1]), z_m=z_m, mask=mask)
+
+    def close(self) -> None:
+        """Free the context."""
+        self._gl.make_current()
+        self._context.free()
+        self._gl.free()
+
+    def _set_frustum(self) -> None:
+        """Give OpenGL the pinhole: pixel centres are at whole numbers here and at halves there."""
+        i = self._intrinsics
+        for side in range(2):
+            camera = self._scene.camera[side]
+            camera.frustum_near, camera.frustum_far = _NEAR_M, _FAR_M
+            camera.frustum_width = _NEAR_M * i.width / i.fx / 2
+            camera.frustum_center = _NEAR_M * (i.width / 2 - (i.cx + 0.5)) / i.fx
+            camera.frustum_top = _NEAR_M * (i.cy + 0.5) / i.fy
+            camera.frustum_bottom = -_NEAR_M * (i.height - i.cy - 0.5) / i.fy
+
+    def _draw_depth_and_mask(self) -> tuple[np.ndarray, np.ndarray]:
+        by_number = [int(mujoco.mjtRndFlag.mjRND_SEGMENT), int(mujoco.mjtRndFlag.mjRND_IDCOLOR)]
+        self._scene.flags[by_number] = True
+        mujoco.mjr_render(self._rect, self._scene, self._context)
+        self._scene.flags[by_number] = False
+        mujoco.mjr_readPixels(self._ids, self._inverse_z, self._rect, self._context)
+        # Reversed depth buffer: d = near·(far − z) / (z·(far − near)); 0 is the far plane, where nothing was drawn.
+        ratio = self._inverse_z[::-1]
+        z_m = _NEAR_M * _FAR_M / (_NEAR_M + ratio * np.float32(_FAR_M - _NEAR_M))
+        z_m[ratio <= 0] = 0.0
+        is_object = np.zeros(self._scene.ngeom + 1, np.bool_)
+        for geom in self._scene.geoms[: self._scene.ngeom]:
+            if geom.segid >= 0 and geom.objtype == mujoco.mjtObj.mjOBJ_GEOM:
+                is_object[geom.segid + 1] = self._is_object[geom.objid]
+        ids = self._ids[::-1, :, 0] + (self._ids[::-1, :, 1].astype(np.uint16) << 8)
+        return np.ascontiguousarray(z_m, np.float32), is_object[ids]
+
+
+def make_context(model: mujoco.MjModel, width: int, height: int, samples: int) -> mujoco.MjrContext:
+    """Return a drawing context whose offscreen buffer is exactly (height, width); a GL context must be current."""
+    sizes = model.vis.global_
+    sizes.offwidth, sizes.offheight = width, height
+    model.vis.quality.offsamples = samples
+    context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+    mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, context)
+    return context

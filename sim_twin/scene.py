@@ -1,0 +1,151 @@
+"""What stands where: one validated description of a scene, and the MuJoCo model made from it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from hal import z1
+from sim_twin.objects import OBJECT_BODY, OBJECT_NAMES, OBJECTS, add_object
+from sim_twin.z1_mjcf import BIT_BASE, BIT_HAND, BIT_SCENE, CONTACT_SOLIMP, CONTACT_SOLREF, GROUP_SCENE, add_z1
+
+PHYSICS_PERIOD_S = z1.CONTROL_PERIOD_S / 2
+"""Two physics steps in a control period: contacts of 4 ms time constant need steps of 2 ms or less [s]."""
+FIXTURE = "fixture"
+
+# Nearer, the open jaws touch the object at home; farther, or more to the side, the wrist cannot face it.
+_DISTANCE_M = (0.30, 0.65)
+_LATERAL_M = (-0.25, 0.25)
+_PITCH_DEG = (-60.0, 60.0)
+_TABLE_FRICTION = (0.4, 0.005, 0.0001)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SceneConfig:
+    """One object on the table in front of the arm.
+
+    Raises:
+        ValueError: a field is out of its range; the message says what is allowed.
+    """
+
+    object: str = "bottle"
+    """One of `sim_twin.objects.OBJECT_NAMES`."""
+    distance_m: float = 0.48
+    """Of the object's origin (mid-height on its axis) from the base, along base x."""
+    lateral_m: float = 0.0
+    """The same along base y."""
+    pitch_deg: float = 0.0
+    """Lean about base y, positive away from the base; other than 0 a break-away fixture holds the object."""
+    seed: int = 0
+    """Of the camera's noise."""
+    noise: bool = True
+    """False gives exact depth (rounded to its unit) and clean colour."""
+
+    def __post_init__(self) -> None:
+        if self.object not in OBJECT_NAMES:
+            raise ValueError(f"there is no object {self.object!r}; choose one of: {', '.join(OBJECT_NAMES)}.")
+        _check_range("distance_m", self.distance_m, _DISTANCE_M, "m in front of the base")
+        _check_range("lateral_m", self.lateral_m, _LATERAL_M, "m to the side")
+        _check_range("pitch_deg", self.pitch_deg, _PITCH_DEG, "degrees of lean")
+        if isinstance(self.seed, bool) or not isinstance(self.seed, int) or not 0 <= self.seed < 2**32:
+            raise ValueError(f"seed is {self.seed!r}; allowed is a whole number from 0 to {2**32 - 1}.")
+
+    def T_base_object(self) -> np.ndarray:
+        """Return the object's pose (4, 4) at the start, its lowest point on the table."""
+        pitch = np.deg2rad(self.pitch_deg)
+        c, s = np.cos(pitch), np.sin(pitch)
+        pose = np.eye(4)
+        pose[:3, :3] = [[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]]
+        lowest = (OBJECTS[self.object].corners() @ pose[2, :3]).min()
+        pose[:3, 3] = [self.distance_m, self.lateral_m, -lowest]
+        return pose
+
+
+def _check_range(name: str, value: float, allowed: tuple[float, float], what: str) -> None:
+    if not (isinstance(value, int | float) and allowed[0] <= value <= allowed[1]):  # NaN fails too
+        raise ValueError(f"{name} is {value!r}; the arm reaches {allowed[0]:g} to {allowed[1]:g} {what}.")
+
+
+def build_model(config: SceneConfig) -> mujoco.MjModel:
+    """Compile arm, table and object."""
+    spec = mujoco.MjSpec()
+    spec.compiler.degree = False
+    _set_options(spec)
+    _add_surroundings(spec)
+    add_z1(spec)
+    add_object(spec, config.object, config.T_base_object())
+    if config.pitch_deg != 0:
+        weld = spec.add_equality(name=FIXTURE, type=mujoco.mjtEq.mjEQ_WELD, objtype=mujoco.mjtObj.mjOBJ_BODY)
+        weld.name1, weld.name2 = OBJECT_BODY, "world"
+        weld.data = [0.0] * 3 + [0.0] * 3 + [0.0] * 4 + [1.0]
+    return spec.compile()
+
+
+def _set_options(spec: mujoco.MjSpec) -> None:
+    option = spec.option
+    option.timestep = PHYSICS_PERIOD_S
+    option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    # Held objects creep by the softness of friction: an elliptic cone and stiff friction rows keep that below 1 mm.
+    option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    option.impratio = 10.0
+    option.iterations = 30
+    spec.stat.extent, spec.stat.center = 1.0, [0.3, 0.0, 0.2]
+    spec.visual.map.znear, spec.visual.map.zfar = 0.01, 20.0
+    spec.visual.headlight.ambient, spec.visual.headlight.diffuse = [0.30, 0.30, 0.32], [0.25, 0.25, 0.25]
+    spec.visual.headlight.specular = [0.0, 0.0, 0.0]
+    spec.visual.quality.shadowsize = 4096
+
+
+def _add_surroundings(spec: mujoco.MjSpec) -> None:
+    texture, builtin = mujoco.mjtTexture, mujoco.mjtBuiltin
+    spec.add_texture(
+        name="sky",
+        type=texture.mjTEXTURE_SKYBOX,
+        builtin=builtin.mjBUILTIN_GRADIENT,
+        rgb1=[0.93, 0.95, 0.97],
+        rgb2=[0.55, 0.66, 0.78],
+        width=256,
+        height=1536,
+    )
+    spec.add_texture(
+        name="floor",
+        type=texture.mjTEXTURE_2D,
+        builtin=builtin.mjBUILTIN_CHECKER,
+        rgb1=[0.44, 0.46, 0.49],
+        rgb2=[0.48, 0.50, 0.53],
+        width=256,
+        height=256,
+    )
+    floor = spec.add_material(name="floor", texrepeat=[8, 8], texuniform=False, specular=0.1, shininess=0.1)
+    floor.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "floor"
+    for name, rgba, specular in (
+        ("table", (0.74, 0.66, 0.55, 1), 0.15),
+        ("link", (0.86, 0.88, 0.91, 1), 0.5),
+        ("dark", (0.20, 0.22, 0.26, 1), 0.5),
+        ("jaw", (0.15, 0.16, 0.19, 1), 0.4),
+        ("camera", (0.62, 0.64, 0.67, 1), 0.6),
+        ("bracket", (0.10, 0.10, 0.11, 1), 0.3),
+    ):
+        spec.add_material(name=name, rgba=rgba, specular=specular, shininess=0.4)
+    world = spec.worldbody
+    sun = world.add_light(name="sun", pos=[-0.3, -1.2, 2.2], dir=[0.35, 0.7, -1.0], castshadow=True)
+    sun.type = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
+    sun.diffuse, sun.specular, sun.ambient = [0.62, 0.60, 0.56], [0.25, 0.25, 0.25], [0.0, 0.0, 0.0]
+    common = {"group": GROUP_SCENE, "type": mujoco.mjtGeom.mjGEOM_BOX}
+    world.add_geom(
+        name="floor", pos=[0, 0, -0.76], size=[4, 4, 0.01], contype=0, conaffinity=0, material="floor", **common
+    )
+    world.add_geom(
+        name="table",
+        pos=[0.35, 0.0, -0.02],
+        size=[0.65, 0.60, 0.02],
+        contype=BIT_SCENE,
+        conaffinity=BIT_SCENE | BIT_BASE | BIT_HAND,
+        friction=_TABLE_FRICTION,
+        solref=CONTACT_SOLREF,
+        solimp=CONTACT_SOLIMP,
+        material="table",
+        **common,
+    )

@@ -1,0 +1,119 @@
+"""The simulated world: one arm, one table, one object, moved forward one control period at a time."""
+
+from __future__ import annotations
+
+import threading
+
+import mujoco
+import numpy as np
+
+from hal import z1
+from sim_twin.fixture import Fixture
+from sim_twin.objects import OBJECT_BODY, OBJECTS
+from sim_twin.scene import PHYSICS_PERIOD_S, SceneConfig, build_model
+
+GRIPPER_START_RAD = -1.0
+_SUBSTEPS = round(z1.CONTROL_PERIOD_S / PHYSICS_PERIOD_S)
+_SETTLE_STEPS = 100
+
+
+class World:
+    """Physics behind a lock: one thread steps it, others may take snapshots.
+
+    The arm starts at home with the jaws open by 1 rad; the object has settled.
+    """
+
+    def __init__(self, config: SceneConfig) -> None:
+        self.config = config
+        self.model = build_model(config)
+        self.data = mujoco.MjData(self.model)
+        self._lock = threading.RLock()
+        self._steps = 0
+        self._corners = OBJECTS[config.object].corners()
+        self._object_id = self.model.body(OBJECT_BODY).id
+        self._fixture = Fixture(self.model) if config.pitch_deg != 0 else None
+        start = np.append(z1.Q_HOME, GRIPPER_START_RAD)
+        self.data.qpos[: z1.N_JOINTS] = start
+        self.set_command(start, np.zeros(z1.N_JOINTS))
+        for _ in range(_SETTLE_STEPS):
+            self.step()
+        self._steps, self.data.time = 0, 0.0
+        mujoco.mj_forward(self.model, self.data)
+        self._start_height_m = self._lowest_m()
+
+    @property
+    def time_s(self) -> float:
+        """Simulated time [s]: whole control periods, free of rounding that adds up."""
+        return self._steps * z1.CONTROL_PERIOD_S
+
+    def step(self) -> None:
+        """Advance by one control period (2 ms)."""
+        with self._lock:
+            mujoco.mj_step(self.model, self.data, nstep=_SUBSTEPS)
+            self._steps += 1
+            if self._fixture is not None and self._fixture.update(self.model, self.data):
+                self._fixture = None
+
+    def advance_to(self, t_s: float) -> None:
+        """Step until `time_s >= t_s` [s]."""
+        while self.time_s < t_s - 1e-9:
+            self.step()
+
+    def set_command(self, q: np.ndarray, dq: np.ndarray) -> None:
+        """Set where the servos pull to: positions (7,) [rad] and velocities (7,) [rad/s]."""
+        with self._lock:
+            self.data.ctrl[:] = z1.KP * q + z1.KD * dq
+
+    def read_arm(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return positions [rad], velocities [rad/s] and motor torques [Nm], each (7,)."""
+        with self._lock:
+            n = z1.N_JOINTS
+            return self.data.qpos[:n].copy(), self.data.qvel[:n].copy(), self.data.qfrc_actuator[:n].copy()
+
+    def T_base_object(self) -> np.ndarray:
+        """Return the object's pose (4, 4): origin at mid-height on its axis, z along the axis."""
+        with self._lock:
+            pose = np.eye(4)
+            position, quat = self.data.qpos[z1.N_JOINTS : z1.N_JOINTS + 3], self.data.qpos[z1.N_JOINTS + 3 :]
+            rotation = np.empty(9)
+            mujoco.mju_quat2Mat(rotation, quat)
+            pose[:3, :3], pose[:3, 3] = rotation.reshape(3, 3), position
+            return pose
+
+    def lifted_m(self) -> float:
+        """Return how much higher the object's lowest point is than at the start [m]."""
+        return float(self._lowest_m() - self._start_height_m)
+
+    @property
+    def fixture_holds(self) -> bool:
+        """True while the break-away fixture of a leaning object has not let go."""
+        return self._fixture is not None
+
+    def snapshot(self, into: mujoco.MjData | None = None) -> mujoco.MjData:
+        """Return the present poses in a copy of the state that no step will touch.
+
+        Args:
+            into: an earlier snapshot to write over, to save the allocation.
+        """
+        copy = into if into is not None else mujoco.MjData(self.model)
+        with self._lock:
+            copy.qpos[:] = self.data.qpos
+            copy.time = self.data.time
+        mujoco.mj_kinematics(self.model, copy)
+        mujoco.mj_comPos(self.model, copy)
+        mujoco.mj_camlight(self.model, copy)
+        return copy
+
+    def render_view(self, width: int, height: int) -> np.ndarray:
+        """Return a picture (height, width, 3) uint8 of the whole scene from outside, for people."""
+        from sim_twin.view import OutsideView
+
+        view = OutsideView(self.model, width, height)
+        try:
+            return view.render(self.snapshot())
+        finally:
+            view.close()
+
+    def _lowest_m(self) -> float:
+        pose = self.T_base_object()
+        return float((self._corners @ pose[2, :3]).min() + pose[2, 3])
