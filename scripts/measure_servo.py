@@ -3,7 +3,8 @@
     python -m scripts.measure_servo --seconds 20
 
 The servo (with the mock arm) and the bare loop run at the same time, each in its own process, so that both meet the
-same stalls, and both ask for SCHED_FIFO. The bare loop is C, compiled with `cc`; without a compiler it is libc's clock_nanosleep called by ctypes.
+same stalls, and both ask for SCHED_FIFO. The bare loop is C, compiled with `cc`; without a compiler it is libc's
+clock_nanosleep called by ctypes.
 The aim: the servo's p99.9 is at most 1.3 times the bare loop's.
 """
 
@@ -104,7 +105,7 @@ def run_bare_python() -> None:
     sys.stdout.buffer.write(times.tobytes())
 
 
-def _make_nanosleep(): -> Callable[[float], None]
+def _make_nanosleep() -> Callable[[float], None]:
     class Timespec(ctypes.Structure):
         _fields_ = (("sec", ctypes.c_long), ("nsec", ctypes.c_long))
 
