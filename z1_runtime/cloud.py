@@ -75,10 +75,9 @@ def back_project(depth_m: np.ndarray, intrinsics: Intrinsics, pixels: np.ndarray
     """
     if depth_m.shape != pixels.shape:
         raise ValueError(f"depth {depth_m.shape} and pixels {pixels.shape} must have the same shape.")
-    index = np.flatnonzero(pixels)
-    v, u = np.divmod(index, depth_m.shape[1])
-    z = depth_m.reshape(-1)[index].astype(float)
-    points = np.empty((len(index), 3))
+    v, u = np.nonzero(pixels)
+    z = depth_m[pixels].astype(float)
+    points = np.empty((len(z), 3))
     points[:, 0] = (u - intrinsics.cx) * z / intrinsics.fx
     points[:, 1] = (v - intrinsics.cy) * z / intrinsics.fy
     points[:, 2] = z
@@ -139,8 +138,8 @@ def radius_inliers(points: np.ndarray, radius_m: float = 0.01, min_neighbours: i
         return np.zeros(len(points), bool)
     # At least m neighbours lie within r exactly if the m-th nearest does; one neighbour is cheaper than counting.
     bound = np.nextafter(radius_m, np.inf)
-    distance, _ = KDTree(points).query(points, k=[min_neighbours + 1], distance_upper_bound=bound)
-    return distance[:, 0] <= radius_m
+    distance, _ = KDTree(points).query(points, k=min_neighbours + 1, distance_upper_bound=bound)
+    return distance[:, -1] <= radius_m
 
 
 def subsample(points: np.ndarray, n_max: int, seed: int = 0) -> np.ndarray:
@@ -197,9 +196,9 @@ class TableConfig:
     n_hypotheses: int = 128
     """RANSAC draws; with 30 % inliers one is clean with 97 % probability."""
     n_points: int = 20_000
-    """Points the plane is fitted to; with 2 mm noise this leaves 0.02 mm."""
+    """Most points the plane is fitted to, evenly chosen; 2 mm of noise on each leave about 0.02 mm."""
     min_inliers: int = 500
-    """Fewer of the `n_points` on the plane is no table."""
+    """Fewer of them on the plane are no table."""
 
 
 def fit_table(
@@ -218,12 +217,16 @@ def fit_table(
 
     Raises:
         NoTableError: too few points near the expected plane, or too few on the best one.
+        ValueError: points that are not finite or not in front of the camera.
     """
     config = config or TableConfig()
     points = _checked(points)
+    if (points[:, 2] <= 0).any():
+        raise ValueError("points of a camera lie in front of it (z > 0); is this cloud in another frame?")
     if hint is not None:
+        points = _thinned(points, 3 * config.n_points)
         points = points[np.abs(hint.height_m(points)) < config.max_height_m]
-    points = points[subsample(points, config.n_points, seed)]
+    points = _thinned(points, config.n_points)
     if len(points) < config.min_inliers:
         raise NoTableError(_no_table(len(points), config, "were seen near where the table should be"))
     plane = _ransac(points, hint, config, seed)
@@ -244,6 +247,10 @@ def fit_table(
         noise = 1.4826 * float(np.median(np.abs(plane.height_m(points[inliers])) / z2[inliers]))
         band = np.clip(3 * noise * z2, 0.25 * config.inlier_m, 3 * config.inlier_m)
     return TableFit(plane=plane, noise_per_m=noise)
+
+
+def _thinned(points: np.ndarray, n_max: int) -> np.ndarray:
+    return points[:: -(-len(points) // n_max) or 1]
 
 
 def _no_table(n: int, config: TableConfig, where: str) -> str:
@@ -269,7 +276,7 @@ def _ransac(points: np.ndarray, hint: Plane | None, config: TableConfig, seed: i
         normals, offsets = normals[near], offsets[near]
     if not len(normals):
         return None
-    judged = points[:: max(1, len(points) // 2000)]
+    judged = _thinned(points, 2000)
     residual = judged @ normals.T - offsets
     best = int(np.argmin(np.minimum(residual**2, config.inlier_m**2).sum(axis=0)))
     return Plane(normal=normals[best], offset_m=float(offsets[best]))

@@ -110,7 +110,7 @@ class TabletopConfig:
     typical_area_m2: float = 5e-4
     """Visible area at which confidence is one half [m²]."""
     border_confidence: float = 0.3
-    """Factor on the confidence of what the image's border cuts: it is clutter, or too little is seen of it."""
+    """Factor on the confidence of what the border of the depth image cuts: clutter, or too little is seen of it."""
     table: TableConfig = field(default_factory=TableConfig)
     own: OwnGripper = field(default_factory=OwnGripper)
 
@@ -163,7 +163,7 @@ class TabletopDetector:
         grow = 2 * round(config.join_m / config.cell_m / 2) + 1
         bridged = cv2.dilate(filled.astype(np.uint8), np.ones((grow, grow), np.uint8))
         _, numbers = cv2.connectedComponents(bridged, connectivity=8)
-        return np.where(filled, numbers, 0).reshape(-1)[cell]
+        return numbers.reshape(-1)[cell]
 
     def _detection(self, pixels: np.ndarray, visible_m2: float, depth_m: np.ndarray) -> Detection:
         config = self._config
@@ -174,11 +174,22 @@ class TabletopDetector:
         filled = cv2.drawContours(np.zeros_like(mask), outlines, -1, 1, thickness=cv2.FILLED)
         # Only what was not measured is filled in: a measured pixel inside the outline is the table or a neighbour.
         whole = mask.astype(bool) | (filled.astype(bool) & (depth_m == 0))
-        box = u_min, v_min, u_max, v_max = mask_box(whole)
-        height, width = depth_m.shape
-        cut = u_min == 0 or v_min == 0 or u_max == width or v_max == height
-        confidence = visible_m2 / (visible_m2 + config.typical_area_m2) * (config.border_confidence if cut else 1.0)
-        return Detection(label="object", confidence=confidence, box_px=box, mask=whole)
+        confidence = visible_m2 / (visible_m2 + config.typical_area_m2)
+        if _is_cut(whole, depth_m):
+            confidence *= config.border_confidence
+        return Detection(label="object", confidence=confidence, box_px=mask_box(whole), mask=whole)
+
+
+def _is_cut(mask: np.ndarray, depth_m: np.ndarray) -> bool:
+    """Return whether the object runs out of the image, or into the band on the left that only one imager sees."""
+    u_min, v_min, u_max, v_max = mask_box(mask)
+    height, width = mask.shape
+    if u_min == 0 or v_min == 0 or u_max == width or v_max == height:
+        return True
+    # The band is as wide as the disparity, hence wider for what is near: it is found as "nothing further left".
+    rows = slice(v_min, v_max)
+    at_band = mask[rows].argmax(axis=1) <= (depth_m[rows] > 0).argmax(axis=1)
+    return bool((at_band & mask[rows].any(axis=1)).mean() > 0.05)
 
 
 _DETECTORS: dict[str, type[Detector]] = {"tabletop": TabletopDetector, "truth": TruthDetector}

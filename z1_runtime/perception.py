@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+import cv2
 import numpy as np
 
 from hal.messages import RgbdFrame
@@ -59,6 +60,10 @@ class PerceptionConfig:
     """Points of the crop lower than this above the table are table [m]; more where the depth noise is more."""
     voxel_m: float = 0.002
     """Voxel of the object's cloud [m]; 0 = none."""
+    rim_px: int = 3
+    """What stands this close around the crop is neither object nor scene [px]: masks are seldom exact."""
+    filter_points: int = 6000
+    """Most points the two neighbour filters are given, evenly chosen: bounds their time to about 20 ms."""
     max_points: int = 5000
     """Most points of the object's cloud."""
     min_points: int = 100
@@ -120,8 +125,10 @@ class Perception:
         continuous = continuous_pixels(depth)
         crop = detection.mask if detection.mask is not None else box_pixels(depth.shape, detection.box_px)
 
-        points = back_project(depth, frame.intrinsics, valid & (continuous | crop))
-        points_crop, points_continuous = (image[valid & (continuous | crop)] for image in (crop, continuous))
+        rim = cv2.dilate(crop.astype(np.uint8), np.ones((2 * config.rim_px + 1,) * 2, np.uint8)).astype(bool)
+        seen = valid & (continuous | crop)
+        points = back_project(depth, frame.intrinsics, seen)
+        points_crop, points_rim, points_continuous = crop[seen], rim[seen], continuous[seen]
         own = config.own.contains(points)
         table = fit_table(points, expected_table(T_base_camera), config.table)
         above = table.above(points, config.min_height_m)
@@ -144,7 +151,7 @@ class Perception:
             detection=detection,
             object_points=object_points,
             # The table under a box-shaped crop is scene; what stands inside the crop is not.
-            scene_points=points[points_continuous & ~own & ~(points_crop & above)],
+            scene_points=points[points_continuous & ~own & ~(points_rim & above)],
             table=table.plane,
         )
 
@@ -152,8 +159,7 @@ class Perception:
         """Return the object's points without outliers, thinned; note the count after each stage in `counts`."""
         config = self._config
         counts["flying off"] = len(points)
-        # Twice the final size bounds the neighbour searches, and voxels still have something to average.
-        points = points[subsample(points, 2 * config.max_points)]
+        points = points[subsample(points, config.filter_points)]
         points = points[statistical_inliers(points, config.statistical_k, config.statistical_n_sigma)]
         counts["statistical"] = len(points)
         points = points[radius_inliers(points, config.radius_m, config.radius_min_neighbours)]

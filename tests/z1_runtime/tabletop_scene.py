@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 
@@ -69,7 +70,9 @@ class Cylinder:
         return np.minimum(side, top)
 
 
-def cast(objects: list[Box | Cylinder], tilt_rad: float = 0.0, lift_m: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+def cast(
+    objects: Sequence[Box | Cylinder], tilt_rad: float = 0.0, lift_m: float = 0.0
+) -> tuple[np.ndarray, np.ndarray]:
     """Return exact depth (480, 640) [m], 0 = nothing hit, and the index of the object hit, −1 = table or nothing.
 
     The table is z = lift_m + x · tan(tilt_rad) in the base frame.
@@ -123,12 +126,16 @@ def d405(depth: np.ndarray, seed: int, noise_px: float = 0.08) -> np.ndarray:
 def frame_of(depth: np.ndarray, truth: np.ndarray | None = None) -> RgbdFrame:
     """Return a grey frame with that depth."""
     colour = np.full((*depth.shape, 3), 128, np.uint8)
-    return RgbdFrame(
-        colour=colour, depth_m=depth, intrinsics=INTRINSICS, stamp_s=0.0, sequence=0, truth_mask=truth
-    )
+    return RgbdFrame(colour=colour, depth_m=depth, intrinsics=INTRINSICS, stamp_s=0.0, sequence=0, truth_mask=truth)
 
 
-def noisy_frame(objects: list[Box | Cylinder], seed: int = 0, target: int = 0, **table: float) -> RgbdFrame:
+def noisy_frame(objects: Sequence[Box | Cylinder], seed: int = 0, target: int = 0, **table: float) -> RgbdFrame:
     """Return objects seen by a D405; `target` is the one in the truth mask."""
     depth, which = cast(objects, **table)
     return frame_of(d405(depth, seed), which == target)
+
+
+def truth(frame: RgbdFrame) -> np.ndarray:
+    """Return the truth mask of a frame that has one."""
+    assert frame.truth_mask is not None
+    return frame.truth_mask

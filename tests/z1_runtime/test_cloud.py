@@ -1,0 +1,244 @@
+"""Each equation against hand figures or brute force, and the table against the analytic scene."""
+
+import numpy as np
+import pytest
+from tabletop_scene import INTRINSICS, Box, T_base_camera, cast, d405
+
+from hal.messages import Intrinsics
+from z1_runtime import cloud
+from z1_runtime.types import Plane
+
+
+def scene(objects, seed=0, **table):
+    depth = d405(cast(objects, **table)[0], seed)
+    return cloud.back_project(depth, INTRINSICS, cloud.valid_pixels(depth, 1.0))
+
+
+def brute_distances(points):
+    return np.linalg.norm(points[:, None] - points[None], axis=2)
+
+
+def test_back_projection_gives_the_numbers_worked_out_by_hand():
+    intrinsics = Intrinsics(width=4, height=3, fx=200.0, fy=100.0, cx=1.0, cy=2.0)
+    depth = np.zeros((3, 4), np.float32)
+    depth[0, 3], depth[2, 1] = 0.5, 0.25
+    points = cloud.back_project(depth, intrinsics, depth > 0)
+    # ((3 − 1) · 0.5 / 200, (0 − 2) · 0.5 / 100, 0.5), and the principal point on the axis.
+    np.testing.assert_allclose(points, [[0.005, -0.01, 0.5], [0.0, 0.0, 0.25]], atol=1e-15)
+
+
+def test_back_projection_inverts_the_camera_matrix():
+    depth, _ = cast([Box(0.45, 0, (0.06, 0.1, 0.18))])
+    pixels = cloud.valid_pixels(depth, 1.0)
+    image = cloud.back_project(depth, INTRINSICS, pixels) @ INTRINSICS.K.T
+    v, u = np.nonzero(pixels)
+    np.testing.assert_allclose(image[:, :2] / image[:, 2:], np.column_stack([u, v]), atol=1e-9)
+
+
+def test_back_projection_refuses_pixels_of_another_image():
+    with pytest.raises(ValueError, match="same shape"):
+        cloud.back_project(np.ones((3, 4)), INTRINSICS, np.ones((4, 3), bool))
+
+
+def test_unmeasured_and_far_pixels_are_invalid():
+    depth = np.array([[0.0, 0.5, 1.0, 1.0001]], np.float32)
+    assert cloud.valid_pixels(depth, 1.0).tolist() == [[False, True, True, False]]
+
+
+def test_a_box_crop_ends_before_its_upper_edges_and_at_the_image():
+    pixels = cloud.box_pixels((4, 5), (1, -2, 3, 2))
+    assert np.argwhere(pixels).tolist() == [[0, 1], [0, 2], [1, 1], [1, 2]]
+    assert not cloud.box_pixels((4, 5), (9, 9, 12, 12)).any()
+
+
+def test_a_lone_depth_between_two_surfaces_is_not_continuous():
+    depth = np.full((7, 9), 0.3)
+    depth[:, 5:] = 0.6
+    depth[3, 5] = 0.45
+    continuous = cloud.continuous_pixels(depth)
+    assert not continuous[3, 5]
+    assert continuous.sum() == depth.size - 1
+
+
+def test_a_hole_continues_nobody_and_its_rim_stays():
+    depth = np.full((9, 9), 0.3)
+    depth[3:6, 3:6] = 0.0
+    assert (cloud.continuous_pixels(depth) == (depth > 0)).all()
+
+
+def test_transform_applies_the_pose_and_its_inverse_undoes_it():
+    T = T_base_camera()
+    points = np.random.default_rng(0).normal(size=(50, 3))
+    np.testing.assert_allclose(cloud.transform(T, np.zeros((1, 3)))[0], T[:3, 3])
+    np.testing.assert_allclose(cloud.transform(np.linalg.inv(T), cloud.transform(T, points)), points, atol=1e-12)
+
+
+def test_the_depth_clip_keeps_what_lies_between_the_percentiles():
+    points = np.zeros((101, 3))
+    points[:, 2] = np.random.default_rng(0).permutation(101)  # percentile p of 0…100 is p
+    assert sorted(points[cloud.depth_clip(points), 2]) == list(range(1, 100))
+    assert sorted(points[cloud.depth_clip(points, 10, 90), 2]) == list(range(10, 91))
+
+
+def test_the_statistical_filter_is_mean_plus_two_sigma_of_the_mean_neighbour_distance():
+    rng = np.random.default_rng(1)
+    points = np.vstack([rng.normal(scale=0.01, size=(300, 3)), rng.uniform(-0.2, 0.2, size=(12, 3))])
+    mean = np.sort(brute_distances(points), axis=1)[:, 1:9].mean(axis=1)
+    expected = mean <= mean.mean() + 2 * mean.std()
+    keep = cloud.statistical_inliers(points, k=8, n_sigma=2.0)
+    assert (keep == expected).all()
+    assert 0 < (~keep).sum() < 20
+
+
+def test_the_statistical_filter_leaves_clouds_smaller_than_its_neighbourhood_alone():
+    points = np.random.default_rng(0).normal(size=(8, 3))
+    assert cloud.statistical_inliers(points, k=8).all()
+
+
+def test_the_radius_filter_counts_neighbours_as_brute_force_does():
+    rng = np.random.default_rng(2)
+    points = rng.uniform(0, 0.05, size=(400, 3))
+    expected = (brute_distances(points) <= 0.008).sum(axis=1) - 1 >= 5
+    keep = cloud.radius_inliers(points, radius_m=0.008, min_neighbours=5)
+    assert (keep == expected).all()
+    assert 0.1 < keep.mean() < 0.9
+
+
+def test_a_neighbour_exactly_at_the_radius_counts():
+    points = np.array([[0.0, 0, 0], [0.5, 0, 0], [1.25, 0, 0]])
+    assert cloud.radius_inliers(points, radius_m=0.5, min_neighbours=1).tolist() == [True, True, False]
+
+
+def test_voxels_are_replaced_by_the_centroid_of_their_points():
+    points = np.array([[0.001, 0.001, 0.001], [0.003, 0.001, 0.002], [-0.001, 0.0, 0.0], [0.011, 0.0, 0.0]])
+    got = cloud.voxel_downsample(points, 0.01)
+    np.testing.assert_allclose(got, [[-0.001, 0, 0], [0.002, 0.001, 0.0015], [0.011, 0, 0]], atol=1e-12)
+
+
+def test_voxels_thin_evenly_and_lose_no_point_by_more_than_a_voxel():
+    points = np.random.default_rng(3).uniform(0, 0.1, size=(5000, 3))
+    got = cloud.voxel_downsample(points, 0.01)
+    assert len(got) <= 1000
+    gap = np.linalg.norm(points[:, None] - got[None], axis=2).min(axis=1)
+    assert gap.max() <= 0.01 * np.sqrt(3)
+
+
+def test_subsampling_repeats_with_its_seed_and_keeps_small_clouds_whole():
+    points = np.zeros((1000, 3))
+    first = cloud.subsample(points, 100, seed=4)
+    assert (first == cloud.subsample(points, 100, seed=4)).all()
+    assert (first != cloud.subsample(points, 100, seed=5)).any()
+    assert len(np.unique(first)) == 100
+    assert (cloud.subsample(points, 1000) == np.arange(1000)).all()
+
+
+@pytest.mark.parametrize(
+    "filter_", [cloud.depth_clip, cloud.statistical_inliers, cloud.radius_inliers, cloud.fit_table]
+)
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_a_cloud_that_is_not_finite_is_refused(filter_, bad):
+    points = np.ones((100, 3))
+    points[7, 1] = bad
+    with pytest.raises(ValueError, match="1 of 100 points are not finite"):
+        filter_(points)
+
+
+def test_a_cloud_of_the_wrong_shape_is_refused():
+    with pytest.raises(ValueError, match=r"\(N, 3\); got \(100, 2\)"):
+        cloud.statistical_inliers(np.ones((100, 2)))
+
+
+def test_empty_clouds_pass_through_the_filters():
+    nothing = np.zeros((0, 3))
+    assert len(cloud.depth_clip(nothing)) == len(cloud.statistical_inliers(nothing)) == 0
+    assert len(cloud.radius_inliers(nothing)) == len(cloud.voxel_downsample(nothing, 0.01)) == 0
+
+
+def table_error(plane: Plane, tilt_rad=0.0, lift_m=0.0):
+    """Return the angle [rad] to the true table and the height error [m] at (0.5, 0) on it."""
+    T = T_base_camera()
+    normal = T[:3, :3].T @ [-np.sin(tilt_rad), 0, np.cos(tilt_rad)]
+    point = T[:3, :3].T @ (np.array([0.5, 0.0, lift_m + 0.5 * np.tan(tilt_rad)]) - T[:3, 3])
+    return np.arccos(min(1.0, plane.normal @ normal)), abs(plane.height_m(point[None])[0])
+
+
+@pytest.mark.parametrize(("seed", "tilt_rad", "lift_m"), [(0, 0.0, 0.0), (1, 0.03, 0.0), (2, -0.03, 0.015)])
+def test_the_table_is_found_within_half_a_millimetre_and_a_third_of_a_degree(seed, tilt_rad, lift_m):
+    points = scene([Box(0.48, 0.05, (0.06, 0.1, 0.18), 0.4)], seed, tilt_rad=tilt_rad, lift_m=lift_m)
+    fit = cloud.fit_table(points, cloud.expected_table(T_base_camera()))
+    angle, height = table_error(fit.plane, tilt_rad, lift_m)
+    assert angle < np.deg2rad(0.3)
+    assert height < 0.0005
+
+
+def test_the_table_of_an_exact_depth_image_is_exact():
+    depth, _ = cast([])
+    points = cloud.back_project(depth, INTRINSICS, cloud.valid_pixels(depth, 1.0))
+    fit = cloud.fit_table(points)
+    angle, height = table_error(fit.plane)
+    assert angle < 1e-6
+    assert height < 1e-9
+    assert fit.noise_per_m < 1e-6
+
+
+def test_the_normal_points_at_the_camera():
+    plane = cloud.fit_table(scene([])).plane
+    assert plane.height_m(np.zeros((1, 3)))[0] == pytest.approx(T_base_camera()[2, 3], abs=0.001)
+    assert np.linalg.norm(plane.normal) == pytest.approx(1.0)
+
+
+def test_a_box_face_that_fills_the_view_is_not_the_table_when_one_is_expected():
+    points = scene([Box(0.45, 0.0, (0.1, 0.45, 0.25))])
+    angle_without, _ = table_error(cloud.fit_table(points).plane)
+    angle, height = table_error(cloud.fit_table(points, cloud.expected_table(T_base_camera())).plane)
+    assert angle_without > np.deg2rad(60)
+    assert angle < np.deg2rad(0.3)
+    assert height < 0.0005
+
+
+def test_a_wide_low_box_does_not_lift_the_table():
+    points = scene([Box(0.48, 0.0, (0.15, 0.2, 0.03))])
+    _, height = table_error(cloud.fit_table(points, cloud.expected_table(T_base_camera())).plane)
+    assert height < 0.0005
+
+
+def test_the_same_seed_gives_the_same_plane_bit_by_bit():
+    points = scene([Box(0.48, 0.05, (0.06, 0.1, 0.18), 0.4)])
+    first, second = (cloud.fit_table(points, seed=3) for _ in range(2))
+    assert first.plane.normal.tobytes() == second.plane.normal.tobytes()
+    assert first.plane.offset_m == second.plane.offset_m
+
+
+def test_the_table_noise_is_measured():
+    # σ_z = z² · 0.08 px / (f B) along a ray that meets the table at about 40°.
+    along_ray = 0.08 / (INTRINSICS.fx * 0.018)
+    fit = cloud.fit_table(scene([]), cloud.expected_table(T_base_camera()))
+    assert 0.4 * along_ray < fit.noise_per_m < along_ray
+
+
+def test_the_threshold_above_the_table_grows_with_the_noise():
+    plane = Plane(normal=np.array([0.0, -1.0, 0.0]), offset_m=-0.3)  # heights are 0.3 − y
+    fit = cloud.TableFit(plane=plane, noise_per_m=0.01)
+    points = np.array([[0, 0.294, 0.2], [0, 0.296, 0.2], [0, 0.294, 0.6], [0, 0.288, 0.6]])
+    assert fit.above(points, min_height_m=0.005).tolist() == [True, False, False, True]
+
+
+def test_nothing_near_the_expected_table_is_an_error():
+    face = scene([Box(0.45, 0.0, (0.1, 0.45, 0.25))])
+    face = face[cloud.transform(T_base_camera(), face)[:, 2] > 0.06]
+    with pytest.raises(cloud.NoTableError, match="only 0 points were seen near"):
+        cloud.fit_table(face, cloud.expected_table(T_base_camera()))
+    with pytest.raises(cloud.NoTableError):
+        cloud.fit_table(np.zeros((0, 3)))
+
+
+def test_scattered_points_are_no_table():
+    rng = np.random.default_rng(0)
+    config = cloud.TableConfig(min_inliers=2000)
+    with pytest.raises(cloud.NoTableError, match="lie on the best plane"):
+        cloud.fit_table(rng.uniform([-0.3, -0.3, 0.3], [0.3, 0.3, 0.9], size=(8000, 3)), config=config)
+
+
+def test_points_behind_the_camera_are_refused():
+    with pytest.raises(ValueError, match="in front of it"):
+        cloud.fit_table(np.random.default_rng(0).normal(size=(1000, 3)))

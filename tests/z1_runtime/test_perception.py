@@ -1,0 +1,174 @@
+"""One frame to clouds and table, on analytic scenes with a D405's errors; and what goes wrong, in words."""
+
+import numpy as np
+import pytest
+from scipy.spatial import KDTree
+from tabletop_scene import INTRINSICS, Box, Cylinder, T_base_camera, cast, frame_of, noisy_frame, truth
+
+from hal.z1 import T_FLANGE_CAMERA
+from models.types import Detection
+from z1_runtime.cloud import back_project, transform
+from z1_runtime.detectors import TabletopDetector, TruthDetector, mask_box
+from z1_runtime.perception import (
+    NoDepthError,
+    NoDetectionError,
+    Perception,
+    PerceptionConfig,
+    PerceptionError,
+    SmallCloudError,
+)
+
+BOTTLE = Cylinder(0.5, 0.05, 0.0325, 0.2)
+BOX = Box(0.45, -0.05, (0.06, 0.1, 0.18), 0.4)
+JAWS = Box(0.25, 0.0, (0.15, 0.08, 0.08), bottom_m=0.16)
+
+
+def make(detector=None, **config):
+    return Perception(PerceptionConfig(**config), detector or TabletopDetector())
+
+
+def surface(objects, target=0):
+    """Return the exact points of what the camera sees of one object."""
+    depth, which = cast(objects)
+    return back_project(depth, INTRINSICS, which == target)
+
+
+class Fixed:
+    """Finds what it is told."""
+
+    classes = ("bottle", "cup")
+
+    def __init__(self, *detections):
+        self._detections = list(detections)
+
+    def detect(self, frame, T_base_camera):
+        return self._detections
+
+
+@pytest.mark.parametrize("detector", [TabletopDetector(), TruthDetector()])
+@pytest.mark.parametrize("target", [BOTTLE, BOX, Cylinder(0.56, 0.15, 0.0325, 0.2)])
+def test_the_objects_cloud_covers_the_object_and_nothing_else(target, detector):
+    seen = make(detector).observe(noisy_frame([target]), T_base_camera())
+    exact = surface([target])
+    assert 1000 < len(seen.object_points) <= 5000
+    # 3σ of the depth noise at 0.5 m is 9 mm; nothing of the table, no flying pixel hangs behind.
+    assert KDTree(exact).query(seen.object_points)[0].max() < 0.01
+    assert (KDTree(seen.object_points).query(exact)[0] < 0.006).mean() >= 0.9
+
+
+def test_the_objects_cloud_holds_no_table():
+    seen = make().observe(noisy_frame([BOX]), T_base_camera())
+    heights = transform(T_base_camera(), seen.object_points)[:, 2]
+    assert heights.min() > 0.004
+    assert heights.min() < 0.010  # nor is more cut off than the noise asks for
+    assert heights.max() == pytest.approx(0.18, abs=0.008)
+
+
+def test_a_box_without_a_mask_gives_the_object_too_and_leaves_its_table_in_the_scene():
+    frame = noisy_frame([BOX])
+    by_mask = make(TruthDetector()).observe(frame, T_base_camera())
+    detection = Detection(label="box", confidence=0.8, box_px=mask_box(truth(frame)))
+    by_box = make().segment(frame, T_base_camera(), detection)
+    exact = surface([BOX])
+    assert KDTree(exact).query(by_box.object_points)[0].max() < 0.01
+    assert (KDTree(by_box.object_points).query(exact)[0] < 0.006).mean() >= 0.9
+    assert len(by_box.scene_points) == pytest.approx(len(by_mask.scene_points), rel=0.01)
+
+
+def test_the_scene_is_the_rest_at_full_resolution():
+    scene = [BOTTLE, Box(0.56, -0.12, (0.05, 0.05, 0.1))]
+    frame = noisy_frame(scene)
+    seen = make().observe(frame, T_base_camera())
+    neighbour = surface(scene, 1)
+    assert (KDTree(seen.scene_points).query(neighbour)[0] < 0.005).mean() > 0.9
+    measured = ((frame.depth_m > 0) & (frame.depth_m <= 1.0)).sum()
+    assert 0.9 * measured < len(seen.scene_points) + truth(frame).sum() < 1.05 * measured
+
+
+def test_no_scene_point_hangs_around_the_object():
+    seen = make().observe(noisy_frame([BOTTLE]), T_base_camera())
+    p_base = transform(T_base_camera(), seen.scene_points)
+    around = np.hypot(p_base[:, 0] - BOTTLE.x, p_base[:, 1] - BOTTLE.y) < 0.08
+    assert (p_base[around, 2] > 0.015).sum() <= 5
+
+
+def test_the_robots_own_jaws_are_neither_object_nor_scene():
+    seen = make().observe(noisy_frame([BOTTLE, JAWS]), T_base_camera())
+    for points in (seen.object_points, seen.scene_points):
+        flange = transform(T_FLANGE_CAMERA, points)
+        own = (np.abs(flange[:, 1]) < 0.04) & (flange[:, 0] > 0.0) & (flange[:, 0] < 0.2) & (flange[:, 2] < 0.1)
+        assert not (own & (flange[:, 2] > -0.035)).any()
+
+
+def test_the_table_comes_in_the_camera_frame():
+    seen = make().observe(noisy_frame([BOTTLE]), T_base_camera())
+    T = T_base_camera()
+    np.testing.assert_allclose(T[:3, :3] @ seen.table.normal, [0, 0, 1], atol=np.deg2rad(0.3))
+    assert seen.table.height_m(np.zeros((1, 3)))[0] == pytest.approx(T[2, 3], abs=0.001)
+
+
+def test_observe_is_detect_and_then_segment_bit_by_bit():
+    frame, perception = noisy_frame([BOTTLE]), make()
+    whole = perception.observe(frame, T_base_camera())
+    parts = perception.segment(frame, T_base_camera(), perception.detect(frame, T_base_camera()))
+    assert whole.object_points.tobytes() == parts.object_points.tobytes()
+    assert whole.scene_points.tobytes() == parts.scene_points.tobytes()
+    assert whole.table.normal.tobytes() == parts.table.normal.tobytes()
+
+
+def test_the_wanted_class_is_taken_even_when_another_is_surer():
+    frame = noisy_frame([BOTTLE])
+    cup = Detection(label="cup", confidence=0.9, box_px=(0, 0, 10, 10))
+    bottle = Detection(label="bottle", confidence=0.6, box_px=mask_box(truth(frame)))
+    perception = make(Fixed(cup, bottle))
+    assert perception.detect(frame, T_base_camera()) is cup
+    assert perception.detect(frame, T_base_camera(), "bottle") is bottle
+
+
+def test_a_detector_without_classes_takes_any_label():
+    assert make().detect(noisy_frame([BOTTLE]), T_base_camera(), "bottle").confidence > 0.5
+
+
+def test_nothing_on_the_table_is_an_error_that_says_what_to_do():
+    with pytest.raises(NoDetectionError, match=r"TabletopDetector found no object\. Put the object"):
+        make().observe(noisy_frame([]), T_base_camera())
+
+
+def test_only_other_classes_is_an_error_that_names_them():
+    cup = Detection(label="cup", confidence=0.9, box_px=(0, 0, 10, 10))
+    with pytest.raises(NoDetectionError, match="found no bottle; it saw cup"):
+        make(Fixed(cup)).detect(noisy_frame([BOTTLE]), T_base_camera(), "bottle")
+
+
+def test_an_empty_depth_image_is_an_error_in_both_steps():
+    frame = frame_of(np.zeros((480, 640), np.float32))
+    detection = Detection(label="object", confidence=1.0, box_px=(100, 100, 200, 200))
+    with pytest.raises(NoDepthError, match="the depth image holds no measurement"):
+        make().detect(frame, T_base_camera())
+    with pytest.raises(NoDepthError, match="the depth image holds no measurement"):
+        make().segment(frame, T_base_camera(), detection)
+
+
+def test_too_few_points_are_an_error_that_counts_each_stage():
+    frame = noisy_frame([BOTTLE])
+    on_the_table = Detection(label="object", confidence=1.0, box_px=(60, 380, 100, 420))
+    with pytest.raises(
+        SmallCloudError, match=r"only \d+ points .* 100 are needed .*crop \d+, depth clip \d+, table off"
+    ):
+        make().segment(frame, T_base_camera(), on_the_table)
+    outside = Detection(label="object", confidence=1.0, box_px=(700, 500, 720, 520))
+    with pytest.raises(SmallCloudError, match="crop 0"):
+        make().segment(frame, T_base_camera(), outside)
+
+
+def test_every_error_is_a_perception_error():
+    for error in (NoDepthError, NoDetectionError, SmallCloudError):
+        assert issubclass(error, PerceptionError)
+    assert issubclass(PerceptionError, RuntimeError)
+
+
+def test_without_voxels_the_cloud_holds_measured_points_only():
+    frame = noisy_frame([BOTTLE])
+    seen = make(voxel_m=0.0).observe(frame, T_base_camera())
+    measured = back_project(frame.depth_m, INTRINSICS, frame.depth_m > 0)
+    assert KDTree(measured).query(seen.object_points)[0].max() == 0.0
