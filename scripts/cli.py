@@ -31,19 +31,22 @@ FAILED, BAD_USAGE, INTERRUPTED = 1, 2, 130
 
 def main(argv: list[str] | None = None) -> int:
     """Run one command and return its exit code: 0 done, 1 failed, 2 bad usage or configuration, 130 interrupted."""
-    arguments = sys.argv[1:] if argv is None else argv
-    if not arguments or arguments[0] in ("-h", "--help", "help"):
+    name, *rest = (sys.argv[1:] if argv is None else argv) or [""]
+    if name in ("", "-h", "--help", "help"):
         print(_usage())
-        return 0 if arguments else BAD_USAGE
-    if arguments[0] in ("-V", "--version"):
+        return 0 if name else BAD_USAGE
+    if name in ("-V", "--version"):
         print(f"z1-grasp {version('z1-grasp')}")
         return 0
-    name, *rest = arguments
     if name not in COMMANDS:
         print(f"error: {_unknown(name)}", file=sys.stderr)
         return BAD_USAGE
+    return _run_guarded(name, rest)
+
+
+def _run_guarded(name: str, arguments: list[str]) -> int:
     try:
-        return _run(name, rest)
+        return _run(name, arguments)
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return INTERRUPTED
@@ -53,9 +56,9 @@ def main(argv: list[str] | None = None) -> int:
     except Exception as error:
         if os.environ.get("Z1_DEBUG") == "1" or not is_for_the_user(error):
             traceback.print_exc()
-            return FAILED
-        print(f"error: {error}", file=sys.stderr)
-        return BAD_USAGE if _is_bad_input(error) else FAILED
+        else:
+            print(f"error: {error}", file=sys.stderr)
+        return BAD_USAGE if is_for_the_user(error) and _is_bad_input(error) else FAILED
 
 
 def _run(name: str, arguments: list[str]) -> int:
