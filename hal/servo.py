@@ -16,23 +16,19 @@ import numpy as np
 
 from hal import playback
 from hal.arm import Arm
-from hal.braking import Blend, Brake, StopPath
 from hal.clock import Clock
 from hal.errors import CommandRefusedError, HalError, NotConnectedError, StoppedError
 from hal.lease import Lease
 from hal.limits import OverloadWatch, ServoLimits, clip_setpoint, find_blocked
 from hal.messages import ArmSetpoint, ArmState, ServoMode, ServoStatus, TrajectoryChunk
+from hal.motion import Motion, Wish
 from hal.periods import PeriodStatistics
 from hal.servo_thread import ServoThread  # noqa: F401  (the servo and its driver are imported from one place)
-from hal.z1 import CONTROL_PERIOD_S, JOINT_NAMES, N_ARM, N_JOINTS
+from hal.z1 import CONTROL_PERIOD_S, JOINT_NAMES, N_ARM
 
 log = logging.getLogger(__name__)
 
-_AT_REST_RAD_S = 0.02
-_GIVE_WAY_RAD = 0.01
 _WARN_EVERY_S = 1.0
-_ZERO = np.zeros(N_JOINTS)
-_ZERO.setflags(write=False)
 
 
 class _Snapshot(NamedTuple):
@@ -79,8 +75,6 @@ class Servo:
         self.periods = PeriodStatistics()
         self._heartbeat_timeout_s = heartbeat_timeout_s
         self._send_timeout_s = send_timeout_s
-        self._brake = Brake(self.limits)
-        self._overload = OverloadWatch(self.limits)
         self._lease = Lease(None if heartbeat_timeout_s is None else lease_timeout_s)
         self._lock = Lock()
         # Written by producers, read by the tick.
@@ -126,18 +120,10 @@ class Servo:
         self.arm.disconnect()
 
     def _reset(self, state: ArmState) -> None:
-        self._mode = ServoMode.HOLDING
-        self._reason = ""
-        self._trajectory_id = 0
-        self._time_s = 0.0
-        self._finished = False
+        self._motion = Motion(self.limits, state.q)
+        self._overload = OverloadWatch(self.limits)
+        self._state, self._q_sent = state, state.q
         self._link_lost = self._give_way = False
-        self._state = state
-        self._q = self._q_sent = self._hold_q = state.q
-        self._dq = self._ddq = _ZERO
-        self._stop_path: StopPath | None = None
-        self._blend: Blend | None = None
-        self._since_s = 0.0  # since the stop path or the blend began, counted in ticks
         self._publish(self.clock.now_s())
 
     def _connected(self) -> _Snapshot:
@@ -358,41 +344,48 @@ class Servo:
             self._cancel_reason = reason
             self._latch = reason
 
-    def _choose(self, now_s: float) -> tuple[np.ndarray, np.ndarray]:
+    def _choose(self, now_s: float) -> Wish:
+        motion = self._motion
         if self._rearmed:
             self._rearmed = self._link_lost = False
-            self._reason = ""
-            self._give_way = True
-        if self._done_id > self._trajectory_id:  # cancelled before its first tick
-            self._trajectory_id, self._time_s, self._finished = self._done_id, 0.0, False
-            self._reason = self._cancel_reason
+            self._give_way, motion.reason = True, ""
+        if self._done_id > motion.trajectory_id:
+            motion.skip(self._done_id, self._cancel_reason)
         current, target = self._playback, self._target
-        playing = current is not None and current.trajectory_id > self._done_id and not self._latch
-        if playing and current is not None:
-            if current.trajectory_id != self._trajectory_id:
-                self._begin(current)
-            late = self._lateness(now_s)
-            self._time_s += CONTROL_PERIOD_S
-            if late:
-                self._drop(current, late)
-            elif self._time_s > current.end_s + 1e-9 and not current.final:
-                self._time_s -= CONTROL_PERIOD_S
-                self._drop(current, f"trajectory {current.trajectory_id} ran dry at {current.end_s:.3f} s")
-            else:
-                return self._play(current)
-        elif target is not None and not self._latch:
-            if now_s - target[1] <= self._send_timeout_s:
-                return self._chase(target[0])
-            self._target = None
-            self._begin_braking("")
-        elif self._mode is ServoMode.TRACKING:
-            self._begin_braking(self._cancel_reason)
         if self._latch:
-            self._reason = self._latch
-            if self._playback is not None:
-                self._done_id = max(self._done_id, self._playback.trajectory_id)
+            self._finish(current)
             self._target = None
-        return self._rest()
+            if motion.mode is ServoMode.TRACKING:
+                motion.brake(self._latch)
+        elif current is not None and current.trajectory_id > self._done_id:
+            return self._follow(current, now_s)
+        elif target is not None and now_s - target[1] <= self._send_timeout_s:
+            return motion.chase(target[0].q)
+        elif motion.mode is ServoMode.TRACKING:
+            motion.brake("" if target else self._cancel_reason)
+            self._target = None
+        if self._give_way and motion.mode is ServoMode.HOLDING:
+            self._give_way = False
+            motion.give_way(self._state.q)
+        return motion.rest()
+
+    def _follow(self, current: playback.Playback, now_s: float) -> Wish:
+        motion = self._motion
+        if current.trajectory_id != motion.trajectory_id:
+            motion.begin(current)
+        late = self._lateness(now_s)
+        if late or motion.runs_dry(current):
+            self._finish(current)
+            motion.brake(late or f"trajectory {current.trajectory_id} ran dry at {current.end_s:.3f} s")
+            return motion.rest()
+        wish = motion.play(current)
+        if motion.finished:
+            self._finish(current)
+        return wish
+
+    def _finish(self, current: playback.Playback | None) -> None:
+        if current is not None:
+            self._done_id = max(self._done_id, current.trajectory_id)
 
     def _lateness(self, now_s: float) -> str:
         silent_s = now_s - self._lease.beat_s
@@ -400,85 +393,12 @@ class Servo:
             return ""
         return f"no heartbeat from {self._lease.owner!r} for {silent_s:.3f} s (allowed {self._heartbeat_timeout_s} s)"
 
-    def _begin(self, new: playback.Playback) -> None:
-        self._trajectory_id, self._time_s = new.trajectory_id, -CONTROL_PERIOD_S
-        self._mode, self._reason, self._finished = ServoMode.TRACKING, "", False
-        self._join(*new.at(0.0))
-
-    def _join(self, q: np.ndarray, dq: np.ndarray) -> None:
-        """Blend from the present command into a motion that begins with `q`, `dq`."""
-        gap, gap_rate = self._q - q, self._dq - dq
-        self._stop_path, self._since_s = None, 0.0
-        self._blend = None
-        if np.abs(gap).max() > 1e-9 or np.abs(gap_rate).max() > 1e-9:
-            self._blend = Blend(gap, gap_rate, self.limits.ddq_max)
-
-    def _play(self, current: playback.Playback) -> tuple[np.ndarray, np.ndarray]:
-        self._time_s = min(self._time_s, current.end_s)  # a blend may outlast the trajectory
-        q, dq = self._blended(*current.at(self._time_s))
-        if current.final and self._time_s >= current.end_s - 1e-9 and self._blend is None:
-            self._finished, self._done_id = True, max(self._done_id, current.trajectory_id)
-            if np.abs(dq).max() > _AT_REST_RAD_S:
-                self._begin_braking(f"trajectory {current.trajectory_id} ended in motion")
-                return self._rest()
-            self._mode, self._hold_q = ServoMode.HOLDING, q
-            return q, _ZERO
-        return q, dq
-
-    def _blended(self, q: np.ndarray, dq: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        if self._blend is None:
-            return q, dq
-        left, left_rate = self._blend.at(self._since_s)
-        if self._since_s >= self._blend.duration_s:
-            self._blend = None
-        self._since_s += CONTROL_PERIOD_S
-        return q + left, dq + left_rate
-
-    def _chase(self, setpoint: ArmSetpoint) -> tuple[np.ndarray, np.ndarray]:
-        self._mode, self._reason, self._blend, self._stop_path = ServoMode.TRACKING, "", None, None
-        step = self.limits.dq_max * CONTROL_PERIOD_S
-        q = np.minimum(np.maximum(setpoint.q, self._q - step), self._q + step)
-        return q, (q - self._q) / CONTROL_PERIOD_S
-
-    def _drop(self, current: playback.Playback, reason: str) -> None:
-        self._done_id = max(self._done_id, current.trajectory_id)
-        self._begin_braking(reason)
-
-    def _begin_braking(self, reason: str) -> None:
-        self._reason = reason
-        self._mode = ServoMode.BRAKING
-        self._blend = None
-        self._stop_path, self._since_s = self._brake.plan(self._q, self._dq, self._ddq), 0.0
-
-    def _rest(self) -> tuple[np.ndarray, np.ndarray]:
-        """Brake if that is not over, else hold."""
-        if self._stop_path is not None:
-            self._since_s += CONTROL_PERIOD_S
-            q, dq = self._stop_path.at(self._since_s)
-            if self._since_s >= self._stop_path.duration_s:
-                self._stop_path, self._mode, self._hold_q = None, ServoMode.HOLDING, q
-            return q, dq
-        if self._give_way:
-            self._give_way = False
-            self._hold_measured()
-        return self._blended(self._hold_q, _ZERO)
-
-    def _hold_measured(self) -> None:
-        hold_q = self._hold_q.copy()
-        off = np.abs(hold_q - self._state.q) > _GIVE_WAY_RAD
-        off[N_ARM] = False  # the gripper goes on holding what it holds
-        if off.any():
-            hold_q[off] = self._state.q[off]
-            self._hold_q = hold_q
-            self._join(hold_q, _ZERO)
-
     def _command(self, q: np.ndarray, dq: np.ndarray) -> None:
         allowed = clip_setpoint(self.limits, q, dq, self._q_sent, self._state.q)
         self._clips += allowed.clipped
-        wanted = np.minimum(np.maximum(q, self.limits.q_min), self.limits.q_max)
-        wanted[:N_ARM] = allowed.q[:N_ARM]
-        self._ddq = (dq - self._dq) / CONTROL_PERIOD_S
-        self._q, self._dq = wanted, dq
+        noted = np.minimum(np.maximum(q, self.limits.q_min), self.limits.q_max)
+        noted[:N_ARM] = allowed.q[:N_ARM]
+        self._motion.take_note(noted, dq)
         if self._link_lost:
             return
         try:
@@ -488,11 +408,16 @@ class Servo:
             self._link_lost = True
 
     def _publish(self, now_s: float) -> None:
-        mode = self._mode
-        if self._latch and mode is not ServoMode.BRAKING:
-            mode = ServoMode.STOPPED
-        reason = self._latch or self._reason
-        time_s = max(self._time_s, 0.0)
+        motion = self._motion
+        stopped = bool(self._latch) and motion.mode is not ServoMode.BRAKING
         self._snapshot = _Snapshot(
-            now_s, mode, reason, self._trajectory_id, time_s, self._finished, self._q_sent, self._q, self._state
+            stamp_s=now_s,
+            mode=ServoMode.STOPPED if stopped else motion.mode,
+            reason=self._latch or motion.reason,
+            trajectory_id=motion.trajectory_id,
+            time_s=max(motion.time_s, 0.0),
+            finished=motion.finished,
+            q_sent=self._q_sent,
+            q_wanted=motion.q,
+            state=self._state,
         )
