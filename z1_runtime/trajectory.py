@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
@@ -13,10 +12,9 @@ from scipy.interpolate import make_interp_spline
 from hal import z1
 from z1_runtime import se3
 from z1_runtime.kinematics import POSITION_TOLERANCE_M, ROTATION_TOLERANCE_RAD, IkFailure, Kinematics
+from z1_runtime.motion_limits import MotionLimits
 from z1_runtime.types import JointTrajectory
 
-DEFAULT_SPEED = 0.5
-"""Fraction of the arm's limits a motion uses unless told otherwise."""
 _LIMIT_ATOL = 1e-9  # rounding [rad]
 
 _OVERSHOOT = 1e-6  # of the way; Ruckig's rounding
@@ -28,10 +26,6 @@ _MIN_WAYPOINTS = 12
 _SPLINE_DEGREE = 5  # continuous jerk
 _BULGE_RAD = 1e-8  # so little over a limit is clipped without a trace in the jerk
 _STRETCH_MARGIN = 1.005  # the peaks between two samples; 1.5 % of the jerk
-
-# At full speed; the Z1's data sheet has no Cartesian figures, these are ours
-_FULL_LINEAR = (0.5, 2.0, 20.0)
-_FULL_ANGULAR = (2.0, 8.0, 80.0)
 
 
 class PathFailure(Exception):
@@ -46,73 +40,6 @@ class PathFailure(Exception):
         super().__init__(message)
         self.fraction = fraction
         self.joint = joint
-
-
-def _scaled(limit: np.ndarray) -> Callable[[], np.ndarray]:
-    return lambda: DEFAULT_SPEED * limit
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class MotionLimits:
-    """How fast a motion may be; `MotionLimits()` is half of what the arm can, see `at_speed`.
-
-    Raises:
-        ValueError: a limit is not positive, not finite, or above `hal.z1`'s.
-    """
-
-    velocity: np.ndarray = field(default_factory=_scaled(z1.DQ_MAX))
-    """(7,) joint speed [rad/s]."""
-    acceleration: np.ndarray = field(default_factory=_scaled(z1.DDQ_MAX))
-    """(7,) joint acceleration [rad/s²]."""
-    jerk: np.ndarray = field(default_factory=_scaled(z1.DDDQ_MAX))
-    """(7,) joint jerk [rad/s³]."""
-    linear_velocity: float = DEFAULT_SPEED * _FULL_LINEAR[0]
-    """Speed of the pivot on straight motions [m/s]."""
-    linear_acceleration: float = DEFAULT_SPEED * _FULL_LINEAR[1]
-    """[m/s²]"""
-    linear_jerk: float = DEFAULT_SPEED * _FULL_LINEAR[2]
-    """[m/s³]"""
-    angular_velocity: float = DEFAULT_SPEED * _FULL_ANGULAR[0]
-    """Turning speed of the pivot on straight motions [rad/s]."""
-    angular_acceleration: float = DEFAULT_SPEED * _FULL_ANGULAR[1]
-    """[rad/s²]"""
-    angular_jerk: float = DEFAULT_SPEED * _FULL_ANGULAR[2]
-    """[rad/s³]"""
-
-    def __post_init__(self) -> None:
-        ceilings = {"velocity": z1.DQ_MAX, "acceleration": z1.DDQ_MAX, "jerk": z1.DDDQ_MAX}
-        for name, ceiling in ceilings.items():
-            limit = np.array(getattr(self, name), dtype=np.float64)
-            if limit.shape != (z1.N_JOINTS,) or not ((limit > 0.0) & (limit <= ceiling * (1 + _LIMIT_ATOL))).all():
-                raise ValueError(f"{name} is {limit}; allowed is (7,), above 0 and up to {ceiling}.")
-            limit.setflags(write=False)
-            object.__setattr__(self, name, limit)
-        for kind in ("linear", "angular"):
-            for name in (f"{kind}_velocity", f"{kind}_acceleration", f"{kind}_jerk"):
-                if not 0.0 < getattr(self, name) < np.inf:
-                    raise ValueError(f"{name} is {getattr(self, name)}; it must be positive and finite.")
-
-    @classmethod
-    def at_speed(cls, speed: float) -> MotionLimits:
-        """Return all limits at fraction `speed` in (0, 1] of the arm's full ones.
-
-        Raises:
-            ValueError: `speed` is outside (0, 1].
-        """
-        if not 0.0 < speed <= 1.0:
-            raise ValueError(f"speed is {speed}; allowed is above 0 and up to 1.")
-        linear, angular = speed * np.array(_FULL_LINEAR), speed * np.array(_FULL_ANGULAR)
-        return cls(
-            velocity=speed * z1.DQ_MAX,
-            acceleration=speed * z1.DDQ_MAX,
-            jerk=speed * z1.DDDQ_MAX,
-            linear_velocity=float(linear[0]),
-            linear_acceleration=float(linear[1]),
-            linear_jerk=float(linear[2]),
-            angular_velocity=float(angular[0]),
-            angular_acceleration=float(angular[1]),
-            angular_jerk=float(angular[2]),
-        )
 
 
 def hold(q: np.ndarray, duration_s: float) -> JointTrajectory:
