@@ -23,6 +23,8 @@ from z1_runtime.cloud import (
     valid_pixels,
 )
 
+_BORDER_PX = 3  # stereo matches windows, not pixels: the outermost ones stay unmeasured
+
 
 class Detector(Protocol):
     """Finds objects in a frame."""
@@ -184,7 +186,7 @@ def _is_cut(mask: np.ndarray, depth_m: np.ndarray) -> bool:
     """Return whether the object runs out of the image, or into the band on the left that only one imager sees."""
     u_min, v_min, u_max, v_max = mask_box(mask)
     height, width = mask.shape
-    if u_min == 0 or v_min == 0 or u_max == width or v_max == height:
+    if min(u_min, v_min, width - u_max, height - v_max) < _BORDER_PX:
         return True
     # The band is as wide as the disparity, hence wider for what is near: it is found as "nothing further left".
     rows = slice(v_min, v_max)

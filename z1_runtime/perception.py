@@ -121,43 +121,36 @@ class Perception:
         """
         _require_depth(frame)
         config, depth = self._config, frame.depth_m
-        valid = valid_pixels(depth, config.d_max_m)
-        continuous = continuous_pixels(depth)
         crop = detection.mask if detection.mask is not None else box_pixels(depth.shape, detection.box_px)
-
         rim = cv2.dilate(crop.astype(np.uint8), np.ones((2 * config.rim_px + 1,) * 2, np.uint8)).astype(bool)
-        seen = valid & (continuous | crop)
+        continuous = continuous_pixels(depth)
+        seen = valid_pixels(depth, config.d_max_m) & (continuous | crop)
         points = back_project(depth, frame.intrinsics, seen)
-        points_crop, points_rim, points_continuous = crop[seen], rim[seen], continuous[seen]
-        own = config.own.contains(points)
         table = fit_table(points, expected_table(T_base_camera), config.table)
         above = table.above(points, config.min_height_m)
+        foreign = ~config.own.contains(points)
 
-        candidates = points[points_crop & ~own]
-        keep = depth_clip(candidates, *config.clip_percent)
-        standing = keep & above[points_crop & ~own]
-        solid = standing & points_continuous[points_crop & ~own]
-        counts = {"crop": len(candidates), "depth clip": int(keep.sum()), "table off": int(standing.sum())}
-        object_points = self._clean(candidates[solid], counts)
-        if len(object_points) < config.min_points:
-            stages = ", ".join(f"{stage} {n}" for stage, n in counts.items())
-            raise SmallCloudError(
-                f"only {len(object_points)} points of the object are left, {config.min_points} are needed (points "
-                f"after each stage: {stages}). Move the object closer, or look at it from another side."
-            )
+        candidate = crop[seen] & foreign
+        object_points = self._clean(points[candidate], above[candidate], continuous[seen][candidate])
         return Observation(
             frame=frame,
             T_base_camera=T_base_camera,
             detection=detection,
             object_points=object_points,
             # The table under a box-shaped crop is scene; what stands inside the crop is not.
-            scene_points=points[points_continuous & ~own & ~(points_rim & above)],
+            scene_points=points[continuous[seen] & foreign & ~(rim[seen] & above)],
             table=table.plane,
         )
 
-    def _clean(self, points: np.ndarray, counts: dict[str, int]) -> np.ndarray:
-        """Return the object's points without outliers, thinned; note the count after each stage in `counts`."""
+    def _clean(self, points: np.ndarray, above: np.ndarray, continuous: np.ndarray) -> np.ndarray:
+        """Return the object among the points of a crop, given which are above the table and which do not fly."""
         config = self._config
+        counts = {"crop": len(points)}
+        keep = depth_clip(points, *config.clip_percent)
+        counts["depth clip"] = int(keep.sum())
+        keep &= above
+        counts["table off"] = int(keep.sum())
+        points = points[keep & continuous]
         counts["flying off"] = len(points)
         points = points[subsample(points, config.filter_points)]
         points = points[statistical_inliers(points, config.statistical_k, config.statistical_n_sigma)]
@@ -167,6 +160,12 @@ class Perception:
         if config.voxel_m > 0:
             points = voxel_downsample(points, config.voxel_m)
             counts["voxel"] = len(points)
+        if len(points) < config.min_points:
+            stages = ", ".join(f"{stage} {n}" for stage, n in counts.items())
+            raise SmallCloudError(
+                f"only {len(points)} points of the object are left, {config.min_points} are needed (points after each "
+                f"stage: {stages}). Move the object closer, or look at it from another side."
+            )
         return points[subsample(points, config.max_points)]
 
 

@@ -8,7 +8,7 @@ from functools import cache
 
 import cv2
 import numpy as np
-import pinocchio as pin
+import pinocchio as pin  # pyright: ignore[reportMissingImports] - a .pth file leads to it
 
 from hal.messages import Intrinsics, RgbdFrame
 from hal.z1 import Q_HOME, T_FLANGE_CAMERA, urdf_path
