@@ -98,6 +98,8 @@ class GraspPlan:
     """From where the arm is to the pre-grasp, jaw opening on the way."""
     approach: JointTrajectory
     """Straight from the pre-grasp to the grasp."""
+    close: JointTrajectory
+    """The jaw alone, from open to past contact: the servo's stiffness makes the squeeze."""
     lift: JointTrajectory
     """Straight up with the object, jaw command closed."""
     rejections: tuple[Rejection, ...]

@@ -1,0 +1,273 @@
+"""Maps a parallel-jaw grasp and a width to the Z1's beak: one fixed jaw, one jaw that turns about the pivot's y axis.
+
+Both inner faces were measured from the STL meshes. A jaw is flat for the 24 mm behind its tip (z = −9 mm with the beak
+closed), then recedes by about 23° towards the palm. The edge between the two, the *knee*, lies 76.7 mm from the
+mover's axis on both jaws. With the beak opened by φ the flats stand φ apart, so they would squeeze an object out like a
+wedge; the knees face each other squarely whatever φ is. A grasp therefore puts the knees on the contact axis, the
+object midway, and splits φ between the two jaws. Objects wider than 65 mm touch the palm first and sit further out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from hal import z1
+
+STATOR_FACE = np.array(
+    [(0.1000, -0.0090), (0.0751, -0.0090), (0.0516, -0.0177), (0.0430, -0.0188), (0.0323, -0.0185), (0.0281, -0.0163)]
+)
+"""(K, 2) x, z of the fixed jaw's inner face in the pivot frame, tip first [m]; the same over the pad's width."""
+MOVER_FACE = np.array(
+    [(0.1000, -0.0090), (0.0762, -0.0090), (0.0727, -0.0083), (0.0569, -0.0012), (0.0493, 0.0009), (0.0410, 0.0013)]
+)
+"""(K, 2) x, z of the moving jaw's inner face in the pivot frame when closed, tip first [m]."""
+KNEE_RADIUS_M = 0.0767
+"""Distance of both knees from the mover's axis [m]."""
+PALM_RADIUS_M = 0.033
+"""The palm is a cylinder about the mover's axis; the mover's root reaches 0.5 mm beyond it [m]."""
+PAD_HALF_WIDTH_M = 0.026
+"""Half the pads' width along the pivot's y at the tips; 0.035 at the knees [m]."""
+JAW_REACH_M = 0.100
+"""Distance of the fingertips from the pivot [m]."""
+
+_WIDTHS_M = np.arange(0.002, 0.120, 0.0005)
+_MOST_PAST = 0.15  # of an object's radius: further, and a thin one would sit behind the knees
+
+
+class WidthError(ValueError):
+    """An object is too wide for the beak, or its width makes no sense."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BeakConfig:
+    """How the beak is laid around an object."""
+
+    contact_depth_m: float = 0.012
+    """How far the grasp's origin, midway between a generator's fingertips, lies beyond the contacts: half of what
+    generators reach past them. The beak's own tips then pass the contacts by some 20 mm [m]."""
+    knee_past_m: float = 0.003
+    """How far the knees go beyond the contact axis along the approach; a little beyond pulls the object in [m]."""
+    palm_clearance_m: float = 0.005
+    """Free space between the palm and an object as deep as it is wide [m]."""
+    stator_clearance_m: float = 0.003
+    """Gap between the fixed jaw and the object while approaching [m]."""
+    opening_clearance_m: float = 0.012
+    """Gap between the moving jaw and the object while approaching; opening wider makes tilted objects collide [m]."""
+    friction: float = 0.4
+    """Least friction coefficient that must keep the object from being squeezed out; rubber on plastic has 0.5 to 1."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class BeakGrasp:
+    """One way to lay the beak around an object."""
+
+    T_base_pivot: np.ndarray
+    """(4, 4) pivot pose at the grasp, before the jaw closes."""
+    jaw_contact: float
+    """Mover angle at which both jaws touch an object of that width [rad]."""
+    jaw_open: float
+    """Mover angle while approaching [rad]."""
+    width_m: float
+    """Object width [m]."""
+    flipped: bool
+    """False: the moving jaw is on the grasp's +y side; True: on its −y side."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class BeakBatch:
+    """Both ways for many grasps."""
+
+    T_base_pivots: np.ndarray
+    """(N, 2, 4, 4) pivot poses; the second is flipped."""
+    jaw_contact: np.ndarray
+    """(N,) [rad]."""
+    jaw_open: np.ndarray
+    """(N,) [rad]."""
+    fits: np.ndarray
+    """(N,) False where the width is refused; the other rows of such a grasp mean nothing."""
+
+
+class BeakGripper:
+    """Lays the beak around objects of given width; knows nothing of arm or scene."""
+
+    def __init__(self, config: BeakConfig | None = None) -> None:
+        self.config = config or BeakConfig()
+        self._steepest = float(np.arctan(self.config.friction))
+        fits = self._fits(_lay_around(_WIDTHS_M, 0.5 * _WIDTHS_M, self.config))
+        self.max_width_m = float(_WIDTHS_M[fits].max(initial=0.0))
+        """Widest round object that is neither squeezed out nor needs more than the full opening [m]."""
+
+    def squeeze_out_angle(self, width_m: float) -> float:
+        """Return the angle [rad] friction must make up for at each jaw; negative when the squeeze pulls inwards."""
+        width = np.array([width_m])
+        return float(_lay_around(width, 0.5 * width, self.config).squeeze_out[0])
+
+    def fit(
+        self, T_base_grasp: np.ndarray, width_m: float, front_m: float | None = None
+    ) -> tuple[BeakGrasp, BeakGrasp]:
+        """Lay the beak around an object of `width_m` at `T_base_grasp` (4, 4), both roll-flips.
+
+        The contact axis runs along the grasp's y, `contact_depth_m` before the origin: there is the middle of a disc
+        of diameter `width_m` that both jaws touch. The fingertips pass it by 20 to 26 mm where the object leaves room
+        before the palm, and by less where not.
+
+        Args:
+            T_base_grasp: (4, 4) the grasp: z approach, y opening, origin midway between a generator's fingertips.
+            width_m: object's width along y [m].
+            front_m: how far the object reaches from the contact axis towards the palm [m]; half the width if None.
+
+        Raises:
+            WidthError: the object is too wide or too deep, or its width is not a positive number.
+        """
+        front = None if front_m is None else np.array([front_m])
+        batch = self.fit_batch(T_base_grasp[None], np.array([width_m]), front)
+        if not batch.fits[0]:
+            raise WidthError(self.refusal(width_m, front_m))
+        one, other = (
+            BeakGrasp(
+                T_base_pivot=batch.T_base_pivots[0, flip],
+                jaw_contact=float(batch.jaw_contact[0]),
+                jaw_open=float(batch.jaw_open[0]),
+                width_m=float(width_m),
+                flipped=bool(flip),
+            )
+            for flip in range(2)
+        )
+        return one, other
+
+    def refusal(self, width_m: float, front_m: float | None = None) -> str:
+        """Say why an object of `width_m` that reaches `front_m` towards the palm does not fit."""
+        if not width_m > 0.0:
+            return f"the width is {width_m} m; it must be a positive number."
+        deep = "" if front_m is None else f" and reaches {front_m * 1e3:.0f} mm from the contacts towards the palm"
+        return (
+            f"the object is {width_m * 1e3:.0f} mm wide{deep}; with a friction coefficient of {self.config.friction} "
+            f"the beak holds a round one of up to {self.max_width_m * 1e3:.0f} mm."
+        )
+
+    def fit_batch(
+        self, T_base_grasps: np.ndarray, widths_m: np.ndarray, fronts_m: np.ndarray | None = None
+    ) -> BeakBatch:
+        """Lay the beak around many objects: grasps (N, 4, 4), widths (N,) and fronts (N,) as in `fit` [m]."""
+        usable = (widths_m > 0.0) & (widths_m < _WIDTHS_M[-1])
+        widths = np.where(usable, widths_m, 0.05)
+        fronts = 0.5 * widths if fronts_m is None else fronts_m
+        lay = _lay_around(widths, fronts, self.config)
+        T_grasp_pivot = _grasp_to_pivot(lay.centre, lay.tilt)
+        T_grasp_pivot[:, 2, 3] -= self.config.contact_depth_m
+        flip = np.diag([-1.0, -1.0, 1.0, 1.0])
+        return BeakBatch(
+            T_base_pivots=np.stack([T_base_grasps @ T_grasp_pivot, T_base_grasps @ flip @ T_grasp_pivot], axis=1),
+            jaw_contact=-lay.contact,
+            jaw_open=np.maximum(-lay.opened, z1.GRIPPER_OPEN),
+            fits=usable & self._fits(lay),
+        )
+
+    def _fits(self, lay: _Lay) -> np.ndarray:
+        return (lay.squeeze_out <= self._steepest) & (lay.opened <= -z1.GRIPPER_OPEN)
+
+
+def mover_pose(jaw: float | np.ndarray) -> np.ndarray:
+    """Return T_pivot_mover (..., 4, 4) at mover angle `jaw` [rad]: a turn about the pivot's y axis."""
+    c, s = np.cos(jaw), np.sin(jaw)
+    T_pivot_mover = np.zeros((*np.shape(jaw), 4, 4))
+    T_pivot_mover[..., 0, 0] = T_pivot_mover[..., 2, 2] = c
+    T_pivot_mover[..., 0, 2], T_pivot_mover[..., 2, 0] = s, -s
+    T_pivot_mover[..., 1, 1] = T_pivot_mover[..., 3, 3] = 1.0
+    return T_pivot_mover
+
+
+class _Lay(NamedTuple):
+    """How the beak lies around N discs, in the pivot's xz plane."""
+
+    contact: np.ndarray
+    """(N,) opening at which both jaws touch [rad]."""
+    opened: np.ndarray
+    """(N,) opening that leaves the clearances [rad]."""
+    centre: np.ndarray
+    """(N, 2) the disc's middle while the jaw is opened [m]."""
+    tilt: np.ndarray
+    """(N,) angle of the approach axis from x towards z [rad]."""
+    squeeze_out: np.ndarray
+    """(N,) half the angle between the two contacts' pushes, positive outwards [rad]."""
+
+
+def _lay_around(widths: np.ndarray, fronts: np.ndarray, config: BeakConfig) -> _Lay:
+    r = 0.5 * widths
+    knees = np.sqrt(np.maximum(KNEE_RADIUS_M**2 - r**2, 0.0)) - np.minimum(config.knee_past_m, _MOST_PAST * r)
+    distance = np.maximum(knees, PALM_RADIUS_M + config.palm_clearance_m + fronts)
+    above, below = _bearing(STATOR_FACE, distance, r, 1.0), _bearing(MOVER_FACE, distance, r, -1.0)
+    contact = above - below
+    centre = _polar(distance, above)
+    on_stator = _nearest(STATOR_FACE, centre)
+    on_mover = _turned(_nearest(MOVER_FACE, _turned(centre, -contact)), contact)
+    across = on_mover - on_stator
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    along = np.column_stack([across[:, 1], -across[:, 0]])
+    push = np.sum((2.0 * centre - on_stator - on_mover) * along, axis=1)
+    above_open = _bearing(STATOR_FACE, distance, r + config.stator_clearance_m, 1.0)
+    below_open = _bearing(MOVER_FACE, distance, r + config.opening_clearance_m, -1.0)
+    # Parallel sides that reach back to the knees want their distance there, whatever a disc would leave
+    flat = 2.0 * np.arcsin(np.minimum((r + 0.5 * config.opening_clearance_m) / KNEE_RADIUS_M, 1.0))
+    return _Lay(
+        contact=contact,
+        opened=np.maximum(above_open - below_open, flat),
+        centre=_polar(distance, above_open),
+        tilt=np.arctan2(along[:, 1], along[:, 0]),
+        squeeze_out=np.arctan2(push, widths),
+    )
+
+
+def _grasp_to_pivot(centre: np.ndarray, tilt: np.ndarray) -> np.ndarray:
+    """Return T_grasp_pivot (N, 4, 4) of grasps at `centre` (N, 2) in the pivot's xz plane.
+
+    `tilt` (N,) is their approach's angle from x towards z [rad].
+    """
+    c, s = np.cos(tilt), np.sin(tilt)
+    x, z = centre.T
+    T = np.zeros((len(x), 4, 4))
+    # Rows are the grasp's axes in the pivot frame: x along the pads' width, y from the fixed jaw to the mover
+    T[:, 0, 1] = T[:, 3, 3] = 1.0
+    T[:, 1, 0], T[:, 1, 2] = -s, c
+    T[:, 2, 0], T[:, 2, 2] = c, s
+    T[:, 1, 3] = s * x - c * z
+    T[:, 2, 3] = -(c * x + s * z)
+    return T
+
+
+def _bearing(face: np.ndarray, distance: np.ndarray, r: np.ndarray, side: float) -> np.ndarray:
+    """Return the angles (N,) [rad] of discs' middles, at `distance` (N,) from the axis, that just touch `face`.
+
+    `side` is +1 when the disc lies above the face, −1 below. The gap grows with the angle: bisection finds it.
+    """
+    on_face = np.arctan2(face[1, 1], face[1, 0])
+    low, high = np.zeros(len(r)), np.full(len(r), 0.5 * np.pi)
+    for _ in range(22):
+        middle = 0.5 * (low + high)
+        centre = _polar(distance, on_face + side * middle)
+        gap = centre - _nearest(face, centre)
+        overlaps = np.sum(gap * gap, axis=1) < r * r
+        low, high = np.where(overlaps, middle, low), np.where(overlaps, high, middle)
+    return on_face + side * high
+
+
+def _polar(distance: np.ndarray, angle: np.ndarray) -> np.ndarray:
+    return np.column_stack([distance * np.cos(angle), distance * np.sin(angle)])
+
+
+def _turned(points: np.ndarray, angle: np.ndarray) -> np.ndarray:
+    c, s = np.cos(angle), np.sin(angle)
+    x, z = points.T
+    return np.column_stack([c * x - s * z, s * x + c * z])
+
+
+def _nearest(face: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Return the points (N, 2) of polyline `face` (K, 2) nearest to `points` (N, 2)."""
+    start, step = face[:-1], np.diff(face, axis=0)
+    t = np.sum((points[:, None] - start) * step, axis=2) / np.sum(step * step, axis=1)
+    feet = start + np.clip(t, 0.0, 1.0)[..., None] * step
+    best = np.sum((feet - points[:, None]) ** 2, axis=2).argmin(axis=1)
+    return feet[np.arange(len(points)), best]

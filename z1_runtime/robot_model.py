@@ -1,0 +1,128 @@
+"""The robot's shape for collision tests: capsules for the links, surface points for gripper, camera and bracket."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+
+from hal import z1
+from z1_runtime.gripper import PALM_RADIUS_M
+from z1_runtime.voxels import spread_first
+
+
+class Capsule(NamedTuple):
+    """All points within `radius_m` of a segment, in the frame of `link`."""
+
+    link: str
+    start: tuple[float, float, float]
+    end: tuple[float, float, float]
+    radius_m: float
+
+
+CAPSULES = (
+    Capsule("link00", (0.0, 0.0, 0.0), (0.0, 0.0, 0.020), 0.060),
+    Capsule("link01", (0.0, -0.033, 0.033), (0.0, 0.033, 0.033), 0.040),
+    Capsule("link02", (-0.350, 0.0, 0.0), (0.0, 0.0, 0.0), 0.030),
+    Capsule("link02", (-0.350, -0.028, 0.0), (-0.350, 0.028, 0.0), 0.037),
+    Capsule("link02", (0.0, -0.028, 0.0), (0.0, 0.028, 0.0), 0.037),
+    Capsule("link03", (0.0, -0.010, 0.0), (0.060, -0.010, 0.055), 0.036),
+    Capsule("link03", (0.050, 0.0, 0.055), (0.218, 0.0, 0.055), 0.034),
+    Capsule("link03", (0.218, -0.016, 0.055), (0.218, 0.0, 0.055), 0.036),
+    Capsule("link04", (0.0, 0.0, 0.0), (0.070, 0.0, 0.0), 0.040),
+    Capsule("link05", (0.0, 0.0, 0.0), (0.030, 0.0, 0.0), 0.040),
+)
+"""Fitted to the collision meshes; no mesh point sticks out further than 10 mm (a test measures it)."""
+
+SELF_PAIRS = (
+    ("link03", ("link00", "link01")),
+    ("link04", ("link00", "link01", "link02")),
+    ("link05", ("link00", "link01", "link02")),
+)
+"""Links that can meet; neighbours on the chain always touch."""
+GRIPPER_OBSTACLES = ("link00", "link01", "link02", "link03")
+"""Links that gripper and camera can meet."""
+
+# D405 datasheet: 42 × 42 × 23 mm. The left imager sits 9 mm left of the middle, 3.7 mm behind the front glass
+_CAMERA_LOW = np.array([-0.012, -0.021, -0.0193])
+_CAMERA_HIGH = np.array([0.030, 0.021, 0.0037])
+# Our mount: a 30 mm wide plate from the wrist's shell to the camera's back
+_BRACKET_FOOT = np.array([0.030, 0.0325, 0.0])
+_BRACKET_HALF_WIDTH_M = 0.015
+_SPACING_M = 0.0075
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GripperShape:
+    """Evenly spread surface points of what the wrist carries, in an order whose every head is spread out."""
+
+    fixed: np.ndarray
+    """(V, 3) wrist, fixed jaw, camera and bracket, in the pivot frame [m]."""
+    mover: np.ndarray
+    """(V, 3) moving jaw, in its own frame: the pivot frame at mover angle 0 [m]."""
+
+    def __len__(self) -> int:
+        return len(self.fixed) + len(self.mover)
+
+
+@cache
+def gripper_shape(spacing_m: float = _SPACING_M) -> GripperShape:
+    """Return the points, sampled from the STL meshes about `spacing_m` apart [m]."""
+    T_pivot_flange = np.linalg.inv(z1.T_FLANGE_PIVOT)
+    T_pivot_stator = np.eye(4)
+    T_pivot_stator[0, 3] = -0.049  # URDF: the mover's joint on the stator
+    stator = _moved(T_pivot_stator, _mesh_surface("z1_GripperStator", spacing_m))
+    # The housing is hollow; nothing gets inside without crossing what surrounds it
+    inside = (np.hypot(stator[:, 0], stator[:, 2]) < PALM_RADIUS_M - 0.002) & (np.abs(stator[:, 1]) < 0.026)
+    wrist = _moved(T_pivot_flange, _mesh_surface("z1_Link06", spacing_m))
+    camera = _moved(T_pivot_flange @ z1.T_FLANGE_CAMERA, _box_surface(_CAMERA_LOW, _CAMERA_HIGH, spacing_m))
+    bracket = _moved(T_pivot_flange, _bracket(spacing_m))
+    fixed = np.concatenate([stator[~inside], wrist, camera, bracket])
+    mover = _mesh_surface("z1_GripperMover", spacing_m)
+    shape = GripperShape(fixed=spread_first(fixed), mover=spread_first(mover))
+    shape.fixed.setflags(write=False)
+    shape.mover.setflags(write=False)
+    return shape
+
+
+def _moved(T: np.ndarray, points: np.ndarray) -> np.ndarray:
+    return points @ T[:3, :3].T + T[:3, 3]
+
+
+def _mesh_surface(name: str, spacing_m: float) -> np.ndarray:
+    """Return surface points of a mesh: many random ones, thinned to one per voxel (the one nearest its middle)."""
+    import trimesh
+
+    mesh = trimesh.load_mesh(z1.mesh_dir() / "collision" / f"{name}.STL")
+    n_dense = int(40.0 * mesh.area / spacing_m**2)
+    dense = np.asarray(trimesh.sample.sample_surface(mesh, n_dense, seed=0)[0])
+    return _thinned(dense, spacing_m)
+
+
+def _thinned(dense: np.ndarray, spacing_m: float) -> np.ndarray:
+    voxel = np.floor(dense / spacing_m)
+    off_centre = np.sum((dense / spacing_m - voxel - 0.5) ** 2, axis=1)
+    order = np.argsort(off_centre, kind="stable")
+    _, first = np.unique(voxel[order], axis=0, return_index=True)
+    return dense[order[first]]
+
+
+def _box_surface(low: np.ndarray, high: np.ndarray, spacing_m: float) -> np.ndarray:
+    """Return a grid over the six faces of an axis-aligned box."""
+    counts = np.maximum(np.ceil((high - low) / spacing_m).astype(int) + 1, 2)
+    axes = [np.linspace(low[a], high[a], counts[a]) for a in range(3)]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    on_surface = (np.isclose(grid, low) | np.isclose(grid, high)).any(axis=1)
+    return grid[on_surface]
+
+
+def _bracket(spacing_m: float) -> np.ndarray:
+    """Return a grid over the plate between wrist and camera, in the flange frame."""
+    back = z1.T_FLANGE_CAMERA[:3, :3] @ np.array([0.0, 0.0, _CAMERA_LOW[2]]) + z1.T_FLANGE_CAMERA[:3, 3]
+    n_along = int(np.ceil(np.linalg.norm(back - _BRACKET_FOOT) / spacing_m)) + 1
+    n_across = int(np.ceil(2.0 * _BRACKET_HALF_WIDTH_M / spacing_m)) + 1
+    along = np.linspace(0.0, 1.0, n_along)[:, None, None]
+    across = np.linspace(-_BRACKET_HALF_WIDTH_M, _BRACKET_HALF_WIDTH_M, n_across)[None, :, None]
+    return (_BRACKET_FOOT + along * (back - _BRACKET_FOOT) + across * np.array([0.0, 0.0, 1.0])).reshape(-1, 3)
