@@ -13,15 +13,13 @@ from hal.z1 import T_FLANGE_CAMERA
 from models.types import Detection
 from z1_runtime.cloud import (
     PerceptionError,
-    TableConfig,
     back_project,
     continuous_pixels,
-    expected_table,
-    fit_table,
     inside_box,
     transform,
     valid_pixels,
 )
+from z1_runtime.table import TableConfig, expected_table, fit_table
 
 _BORDER_PX = 3  # stereo matches windows, not pixels: the outermost ones stay unmeasured
 

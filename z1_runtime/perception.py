@@ -11,13 +11,10 @@ from hal.messages import RgbdFrame
 from models.types import Detection
 from z1_runtime.cloud import (
     PerceptionError,
-    TableConfig,
     back_project,
     box_pixels,
     continuous_pixels,
     depth_clip,
-    expected_table,
-    fit_table,
     radius_inliers,
     statistical_inliers,
     subsample,
@@ -25,6 +22,7 @@ from z1_runtime.cloud import (
     voxel_downsample,
 )
 from z1_runtime.detectors import Detector, OwnGripper
+from z1_runtime.table import TableConfig, expected_table, fit_table
 from z1_runtime.types import Observation
 
 

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from tabletop_scene import INTRINSICS, Box, Cylinder, T_base_camera, cast, d405, frame_of, noisy_frame, truth
 
-from z1_runtime.cloud import NoTableError, PerceptionError
+from z1_runtime.cloud import PerceptionError
 from z1_runtime.detectors import OwnGripper, TabletopDetector, TruthDetector, make_detector, mask_box
+from z1_runtime.table import NoTableError
 
 BOTTLE = Cylinder(0.5, 0.0, 0.0325, 0.2)
 JAWS = Box(0.25, 0.0, (0.15, 0.08, 0.08), bottom_m=0.16)
