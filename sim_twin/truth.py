@@ -1,4 +1,4 @@
-"""What only the twin knows, over Zenoh and for evaluation alone: where the object is, how the scene looks from aside."""
+"""What only the twin knows, over Zenoh and for evaluation alone: where the object is, how the scene looks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Everything a user may tune, in one tree: defaults here, then a YAML file, then the command line; the last one wins."""
+"""Everything a user may tune, in one tree: defaults here, then a YAML file, then the command line."""
 
 from __future__ import annotations
 

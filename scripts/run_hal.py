@@ -1,0 +1,99 @@
+"""Serve an arm and a camera over Zenoh: servo at 500 Hz, limits, watchdog and stop.
+
+    ./z1 hal --hal sim --object bottle      the digital twin
+    ./z1 hal --hal mock                     an arm without physics, for trying clients
+
+Stop it with Ctrl-C: it brakes, holds, and lets go.
+"""
+
+from __future__ import annotations
+
+import logging
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from threading import Event, Thread
+from typing import Annotated
+
+import tyro
+
+from hal.bus.session import BusConfig, open_session
+from hal.process import serve, stop_on_signals
+from hal.rig import RIGS, Rig
+
+READY = "ready"
+"""The line printed once everything answers."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config:
+    """Which hardware, where, and for the twin what stands on the table."""
+
+    hal: str = "sim"
+    """Which rig: `sim` is the twin, `mock` an arm without physics."""
+    object: str = "bottle"
+    """Twin: what stands on the table: bottle, box or cylinder."""
+    distance_m: float = 0.48
+    """Twin: how far in front of the base [m]."""
+    lateral_m: float = 0.0
+    """Twin: how far to the left [m]."""
+    pitch_deg: float = 0.0
+    """Twin: lean about the base's y axis [°]."""
+    seed: int = 0
+    """Twin: seed of the camera's noise."""
+    bus: Annotated[BusConfig, tyro.conf.arg(name="")] = field(default_factory=BusConfig)
+    """Where to listen."""
+    until_stdin_closes: bool = False
+    """End when standard input closes: whoever started this process and dies takes it along, after braking."""
+
+
+def main(config: Config) -> int:
+    """Serve until told to stop."""
+    logging.basicConfig(level=logging.INFO, format="hal: %(message)s")
+    rig = make_rig(config)
+    stop_event = Event()
+    stop_on_signals(stop_event)
+    if config.until_stdin_closes:
+        Thread(target=_watch_stdin, args=(stop_event,), daemon=True).start()
+    evaluation: list[Callable[[], None]] = []
+
+    def ready() -> None:
+        if rig.world is not None:
+            from sim_twin.truth import TruthServer
+
+            session = open_session(config.bus, listen=False)
+            evaluation.extend([TruthServer(session, rig.world).close, session.close])
+        print(READY, flush=True)
+
+    try:
+        serve(rig, config.bus, stop_event, on_ready=ready)
+    finally:
+        for close in evaluation:
+            close()
+    return 0
+
+
+def make_rig(config: Config) -> Rig:
+    """Return the rig that `config` names, living by the wall clock.
+
+    Raises:
+        UnknownBackendError: no such rig.
+        ValueError: the scene is out of range.
+    """
+    if config.hal != "sim":
+        return RIGS.make(config.hal)
+    from sim_twin.scene import SceneConfig
+
+    scene = SceneConfig(
+        object=config.object,
+        distance_m=config.distance_m,
+        lateral_m=config.lateral_m,
+        pitch_deg=config.pitch_deg,
+        seed=config.seed,
+    )
+    return RIGS.make("sim", scene=scene)
+
+
+def _watch_stdin(stop_event: Event) -> None:
+    sys.stdin.buffer.read()
+    stop_event.set()

@@ -1,0 +1,71 @@
+"""See, plan and pick once, against a HAL process that runs already (`./z1 hal`).
+
+./z1 hal --hal sim          in one terminal
+./z1 run                    in another
+"""
+
+from __future__ import annotations
+
+import logging
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+
+from hal.bus.client import RemoteArm, RemoteCamera
+from hal.bus.session import BusConfig
+from hal.clock import WallClock
+from z1_runtime.assembly import make_decider
+from z1_runtime.config import load_config
+from z1_runtime.inspect import Inspector
+from z1_runtime.pipeline import PickPipeline
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config:
+    """Where the HAL is and how the pick is done."""
+
+    config: Path | None = None
+    """A YAML file of settings (see `./z1 show-config`)."""
+    out: Path | None = None
+    """Folder for episode.rrd."""
+    view: bool = False
+    """Show everything live in Rerun."""
+    bus: Annotated[BusConfig, tyro.conf.arg(name="")] = field(default_factory=BusConfig)
+    """Where the HAL process listens."""
+
+
+def main(config: Config) -> int:
+    """Run one pick; 0 only if the jaws hold something afterwards."""
+    logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
+    console = Console(highlight=False)
+    runtime = load_config(config.config)
+    decider = make_decider(runtime)
+    decider.warm_up()
+    clock = WallClock()
+    with ExitStack() as undo:
+        arm = RemoteArm(config.bus, "run", clock)
+        arm.connect()
+        undo.callback(arm.disconnect)
+        camera = RemoteCamera(config.bus, clock)
+        camera.connect()
+        undo.callback(camera.disconnect)
+        inspector = Inspector(config.out / "episode.rrd" if config.out else None, live=config.view)
+        undo.callback(inspector.close)
+        pipeline = PickPipeline(
+            decider=decider,
+            arm=arm,
+            camera=camera,
+            clock=clock,
+            inspector=inspector,
+            config=runtime,
+            on_phase=lambda phase: console.print(f"  {phase.name:<9} {phase.duration_s:6.2f} s"),
+        )
+        arm.claim("run")
+        undo.callback(arm.release)
+        record = pipeline.pick()
+    console.print("the jaws hold something" if record.held else "the jaws are empty")
+    return 0 if record.held else 1

@@ -1,0 +1,139 @@
+"""From one frame to one plan: Algorithm 1 of MVB-Grasp up to the motion; each stage timed, nothing moves."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+
+from hal import z1
+from hal.clock import Stopwatch
+from hal.messages import Intrinsics, RgbdFrame
+from models.mvbb import RankedGrasps, fit_obb, rank_grasps
+from models.types import GraspGenerator, GraspSet
+from z1_runtime.config import RuntimeConfig
+from z1_runtime.kinematics import Kinematics
+from z1_runtime.perception import Perception
+from z1_runtime.planner import GraspPlanner
+from z1_runtime.types import GraspPlan, Observation
+
+
+class StageTimes:
+    """Real milliseconds each stage took, by name, in the order the stages ended."""
+
+    def __init__(self) -> None:
+        self.ms: dict[str, float] = {}
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Add the time the body takes to stage `name`."""
+        watch = Stopwatch()
+        try:
+            yield
+        finally:
+            self.ms[name] = self.ms.get(name, 0.0) + watch.lap_ms()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Decision:
+    """Everything between one frame and the motion it leads to."""
+
+    observation: Observation
+    candidates: GraspSet
+    ranked: RankedGrasps
+    plan: GraspPlan
+    stage_ms: dict[str, float]
+    """By stage: detect, cloud, generate, mvbb, ik, collision, plan, and their total."""
+
+
+class Decider:
+    """Sees, proposes, filters by the box, and plans.
+
+    Args:
+        kinematics: of the arm.
+        perception: makes clouds of a frame.
+        generator: proposes grasps.
+        planner: finds the first that the arm can do.
+        config: the numbers of the algorithm.
+        T_flange_camera: (4, 4) hand-eye transform.
+    """
+
+    def __init__(
+        self,
+        *,
+        kinematics: Kinematics,
+        perception: Perception,
+        generator: GraspGenerator,
+        planner: GraspPlanner,
+        config: RuntimeConfig,
+        T_flange_camera: np.ndarray = z1.T_FLANGE_CAMERA,
+    ) -> None:
+        self.kinematics = kinematics
+        self.perception = perception
+        self.generator = generator
+        self.planner = planner
+        self.config = config
+        self.T_flange_camera = T_flange_camera
+
+    def decide(self, frame: RgbdFrame, q: np.ndarray) -> Decision:
+        """Turn one frame, taken at joint positions `q` (7,), into a plan.
+
+        Raises:
+            PerceptionError: nothing usable was seen.
+            DegenerateCloudError: the object's cloud spans no box.
+            NoPlanError: no candidate can be executed; the message counts why.
+        """
+        config = self.config
+        times = StageTimes()
+        with times.stage("total"):
+            T_base_camera = self.kinematics.flange(q[: z1.N_ARM]) @ self.T_flange_camera
+            with times.stage("detect"):
+                detection = self.perception.detect(frame, T_base_camera)
+            with times.stage("cloud"):
+                observation = self.perception.segment(frame, T_base_camera, detection)
+            with times.stage("generate"):
+                candidates = self.generator.sample(observation.object_points, config.n_candidates, config.seed)
+            with times.stage("mvbb"):
+                up = T_base_camera[2, :3]  # the base's z axis, seen from the camera
+                box = fit_obb(observation.object_points, config.box_method, up=up)
+                ranked = rank_grasps(candidates, box, k=config.k_faces, alpha=config.alpha)
+            plan = self.planner.plan(ranked.grasps, observation, q, times.stage)  # ik, collision, plan
+        return Decision(
+            observation=observation, candidates=candidates, ranked=ranked, plan=plan, stage_ms=dict(times.ms)
+        )
+
+    def warm_up(self) -> None:
+        """Decide once on a drawn scene, so that the first real frame does not wait for compilers and caches."""
+        q = np.append(z1.Q_HOME, self.config.jaw_home)
+        self.decide(draw_can(self.kinematics.flange(z1.Q_HOME) @ self.T_flange_camera), q)
+
+
+def draw_can(T_base_camera: np.ndarray, radius_m: float = 0.03, height_m: float = 0.15) -> RgbdFrame:
+    """Return an exact frame, from `T_base_camera` (4, 4), of an upright can 0.48 m in front of the base."""
+    intrinsics = Intrinsics(width=640, height=480, fx=393.0, fy=393.0, cx=319.5, cy=239.5)
+    v, u = np.mgrid[: intrinsics.height, : intrinsics.width]
+    rays = np.stack([(u - intrinsics.cx) / intrinsics.fx, (v - intrinsics.cy) / intrinsics.fy, np.ones(u.shape)], -1)
+    d = rays @ T_base_camera[:3, :3].T  # per metre of depth, in the base frame
+    eye = T_base_camera[:3, 3] - [0.48, 0.0, 0.0]
+
+    with np.errstate(divide="ignore", invalid="ignore"):
+        table = np.where(d[..., 2] < 0, -eye[2] / d[..., 2], np.inf)
+        a = d[..., 0] ** 2 + d[..., 1] ** 2
+        b = d[..., 0] * eye[0] + d[..., 1] * eye[1]
+        side = (-b - np.sqrt(b**2 - a * (eye[0] ** 2 + eye[1] ** 2 - radius_m**2))) / a
+        side_z = eye[2] + side * d[..., 2]
+        side = np.where((side_z > 0) & (side_z < height_m), side, np.inf)
+        lid = np.where(d[..., 2] < 0, (height_m - eye[2]) / d[..., 2], np.inf)
+        lid_off = (eye[0] + lid * d[..., 0]) ** 2 + (eye[1] + lid * d[..., 1]) ** 2
+        lid = np.where(lid_off < radius_m**2, lid, np.inf)
+    depth = np.minimum(table, np.fmin(side, lid))
+    depth[~(depth < 1.5)] = 0.0
+    return RgbdFrame(
+        colour=np.zeros((*depth.shape, 3), np.uint8),
+        depth_m=depth,
+        intrinsics=intrinsics,
+        stamp_s=0.0,
+        sequence=0,
+    )
