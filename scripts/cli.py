@@ -26,6 +26,9 @@ without `Config` takes the bare arguments: `main(list[str]) -> int`."""
 
 ROOMS = ("hal", "models", "calibration", "z1_runtime", "sim_twin", "scripts")
 
+BAD_INPUT = {"ConfigError", "UnknownBackendError", "ViewerPortError"}
+"""Errors of ours that say the call was wrong, not that the work failed; so is a plain `ValueError` of our own."""
+
 FAILED, BAD_USAGE, INTERRUPTED = 1, 2, 130
 
 
@@ -83,9 +86,7 @@ def is_for_the_user(error: BaseException) -> bool:
 
 
 def _is_bad_input(error: BaseException) -> bool:
-    from hal.errors import InvalidMessageError
-
-    return isinstance(error, ValueError | KeyError) and not isinstance(error, InvalidMessageError)
+    return type(error) is ValueError or type(error).__name__ in BAD_INPUT
 
 
 def _raised_in(traceback_: TracebackType | None) -> str:

@@ -1,0 +1,53 @@
+"""`./z1 show-config`: every setting in force, as YAML that `--config` takes back, and where each value came from."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from z1_runtime.config import load_config
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShowConfig:
+    """What to show."""
+
+    config: Path | None = None
+    """YAML file whose values go over the defaults."""
+
+
+Config = ShowConfig
+
+
+def main(config: ShowConfig) -> int:
+    """Print the configuration.
+
+    Raises:
+        ConfigError: the file cannot be used.
+    """
+    resolved = asdict(load_config(config.config))
+    given = yaml.safe_load(config.config.read_text()) or {} if config.config else {}
+    print("\n".join(to_lines(resolved, given, str(config.config))))
+    return 0
+
+
+def to_lines(values: Mapping[str, Any], given: Mapping[str, Any], source: str, depth: int = 0) -> Iterator[str]:
+    """Yield `values` as lines of YAML; each says in a comment whether `given`, read from `source`, holds its key."""
+    indent = "  " * depth
+    for key, value in values.items():
+        if isinstance(value, Mapping) and value:
+            yield f"{indent}{key}:"
+            yield from to_lines(value, given.get(key) or {}, source, depth + 1)
+        else:
+            text = yaml.safe_dump(_plain(value), default_flow_style=True, width=10_000).removesuffix("...\n").strip()
+            yield f"{indent}{key}: {text}  # {source if key in given else 'default'}"
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, tuple | list):
+        return [_plain(item) for item in value]
+    return value if isinstance(value, int | float | str | bool | None) else str(value)

@@ -1,0 +1,51 @@
+"""`./z1 stop`: the arm brakes, holds, and takes no command until `./z1 rearm`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Annotated
+
+import tyro
+
+from hal.bus import keys
+from hal.bus.codec import decode
+from hal.bus.link import Link
+from hal.bus.session import BusConfig
+from hal.clock import WallClock
+from hal.messages import ServoStatus
+
+
+@dataclass(frozen=True, kw_only=True)
+class StopConfig:
+    """Which arm, and why."""
+
+    reason: str = "./z1 stop"
+    """What the arm's status will say."""
+    bus: Annotated[BusConfig, tyro.conf.arg(name="")] = field(default_factory=BusConfig)
+
+
+Config = StopConfig
+
+
+def main(config: StopConfig) -> int:
+    """Stop the arm and print what the servo says.
+
+    Raises:
+        HalTimeoutError: no HAL process answers.
+    """
+    # Not `RemoteArm`: it waits for the arm's first state, and a stop must get through to an arm that sends none.
+    link = Link(config.bus, WallClock(), "the arm")
+    try:
+        link.ask(keys.STOP, config.reason.encode(), "stop command")
+        print(describe(decode(link.ask(keys.READ_STATUS), ServoStatus)))
+    finally:
+        link.close()
+    print("nothing moves until somebody has looked at the arm and typed: ./z1 rearm")
+    return 0
+
+
+def describe(status: ServoStatus) -> str:
+    """Return `status` as one line."""
+    reason = f" ({status.reason})" if status.reason else ""
+    owner = f", owned by {status.owner}" if status.owner else ""
+    return f"servo: {status.mode.value}{reason}{owner}"
