@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
+from itertools import pairwise
 
 import numpy as np
 import trimesh
@@ -27,8 +28,7 @@ class Region:
 
 
 def _slabs(*edges: float, offset: float = 0.0, **other: tuple[float, float]) -> tuple[Region, ...]:
-    pairs = zip(edges[:-1], edges[1:], strict=True)
-    return tuple(Region(x=(low + offset, high + offset), **other) for low, high in pairs)
+    return tuple(Region(x=(low + offset, high + offset), **other) for low, high in pairwise(edges))
 
 
 # Along x of the pivot frame. The inner faces of both jaws are prisms in y: a hollow from 34 to 74.5 mm, then a flat

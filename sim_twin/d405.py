@@ -95,8 +95,9 @@ def _seen_by_both(z: np.ndarray, focal_baseline: float) -> np.ndarray:
 
 
 @numba.njit(nogil=True, cache=True)
-def _is_grazing(z: np.ndarray, v: int, u: int, fx: float, fy: float, cx: float, cy: float) -> bool:
+def _is_grazing(z: np.ndarray, v: int, u: int, pinhole: tuple[float, float, float, float]) -> bool:
     """True where the surface through the four neighbours is seen at too flat an angle."""
+    fx, fy, cx, cy = pinhole
     zc = z[v, u]
     x, y = (u - cx) / fx, (v - cy) / fy
     zu, zv = 0.5 * (z[v, u + 1] - z[v, u - 1]) * fx, 0.5 * (z[v + 1, u] - z[v - 1, u]) * fy
@@ -107,9 +108,9 @@ def _is_grazing(z: np.ndarray, v: int, u: int, fx: float, fy: float, cx: float, 
 
 
 @numba.njit(nogil=True, cache=True)
-def _measure(z: np.ndarray, key: np.uint64, fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
+def _measure(z: np.ndarray, key: np.uint64, pinhole: tuple[float, float, float, float]) -> np.ndarray:
     height, width = z.shape
-    focal_baseline = fx * BASELINE_M
+    focal_baseline = pinhole[0] * BASELINE_M
     noise = _smooth_noise(height, width, key, _CORRELATION_PX)
     seen = _seen_by_both(z, focal_baseline)
     out = np.zeros((height, width), np.float32)
@@ -123,7 +124,7 @@ def _measure(z: np.ndarray, key: np.uint64, fx: float, fy: float, cx: float, cy:
                 low, high = min(low, near), max(high, near)
             if high - low > _EDGE_RATIO * zc:
                 share = float(_hash(key ^ np.uint64(v * width + u + 0x5DEECE66D)) >> np.uint64(11)) / 2.0**53
-                if share < _EDGE_LOSS or _is_grazing(z, v, u, fx, fy, cx, cy):
+                if share < _EDGE_LOSS or _is_grazing(z, v, u, pinhole):
                     continue
             disparity = focal_baseline / zc + DISPARITY_SD_PX * noise[v, u]
             disparity = np.round(disparity / DISPARITY_STEP_PX) * DISPARITY_STEP_PX
@@ -177,7 +178,7 @@ def measure_depth(z: np.ndarray, seed: int, sequence: int) -> np.ndarray:
     the edges, on surfaces seen at a grazing angle, and in small patches at random.
     """
     i = INTRINSICS
-    return _measure(z, _key(seed, sequence), i.fx, i.fy, i.cx, i.cy)
+    return _measure(z, _key(seed, sequence), (i.fx, i.fy, i.cx, i.cy))
 
 
 def round_depth(z: np.ndarray) -> np.ndarray:

@@ -62,16 +62,25 @@ class GraspObject:
         return np.vstack([part.corners() for part in self.parts])
 
 
-def _lathe(profile: tuple[tuple[float, float], ...], shares: tuple[tuple[float, tuple], ...]) -> tuple[Part, ...]:
+def _lathe(profile: tuple[tuple[float, float], ...], parts: tuple[tuple[float, tuple], ...]) -> tuple[Part, ...]:
     """Return one part per segment of a profile of (height, radius) [m], heights from the foot."""
     middle = profile[-1][0] / 2
-    parts = []
-    for (z0, r0), (z1, r1), (mass_kg, rgba) in zip(profile[:-1], profile[1:], shares, strict=True):
+    made = []
+    for (z0, r0), (z1, r1), (mass_kg, rgba) in zip(profile[:-1], profile[1:], parts, strict=True):
         kind, size = ("cylinder", (r0, (z1 - z0) / 2)) if r0 == r1 else ("frustum", (r0, r1, (z1 - z0) / 2))
-        parts.append(Part(kind=kind, size_m=size, z_m=(z0 + z1) / 2 - middle, mass_kg=mass_kg, rgba=rgba))
-    return tuple(parts)
+        made.append(Part(kind=kind, size_m=size, z_m=(z0 + z1) / 2 - middle, mass_kg=mass_kg, rgba=rgba))
+    return tuple(made)
 
 
+_BOTTLE_PROFILE = (
+    (0.000, 0.030),
+    (0.004, 0.033),
+    (0.060, 0.033),
+    (0.120, 0.033),
+    (0.150, 0.033),
+    (0.178, 0.013),
+    (0.200, 0.013),
+)
 _PET, _LABEL, _CAP = (0.42, 0.66, 0.80, 1.0), (0.90, 0.92, 0.95, 1.0), (0.10, 0.28, 0.62, 1.0)
 
 OBJECTS: dict[str, GraspObject] = {

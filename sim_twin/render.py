@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import mujoco
+import numba
 import numpy as np
 
 from hal.errors import CameraError
@@ -96,6 +97,8 @@ class EglRenderer:
     """Two passes on one framebuffer of the camera's size: geom numbers with depth, then colour."""
 
     def __init__(self, model: mujoco.MjModel, intrinsics: Intrinsics) -> None:
+        # Software GL would take every core for itself; one leaves the others to the servo. Read when GL is loaded.
+        os.environ.setdefault("LP_NUM_THREADS", "1")
         from mujoco.egl import GLContext
 
         self._model, self._intrinsics = model, intrinsics
@@ -153,16 +156,29 @@ class EglRenderer:
         mujoco.mjr_render(self._rect, self._scene, self._context)
         self._scene.flags[by_number] = False
         mujoco.mjr_readPixels(self._ids, self._inverse_z, self._rect, self._context)
-        # Reversed depth buffer: d = near·(far − z) / (z·(far − near)); 0 is the far plane, where nothing was drawn.
-        ratio = self._inverse_z[::-1]
-        z_m = _NEAR_M * _FAR_M / (_NEAR_M + ratio * np.float32(_FAR_M - _NEAR_M))
-        z_m[ratio <= 0] = 0.0
         is_object = np.zeros(self._scene.ngeom + 1, np.bool_)
         for geom in self._scene.geoms[: self._scene.ngeom]:
             if geom.segid >= 0 and geom.objtype == mujoco.mjtObj.mjOBJ_GEOM:
                 is_object[geom.segid + 1] = self._is_object[geom.objid]
-        ids = self._ids[::-1, :, 0] + (self._ids[::-1, :, 1].astype(np.uint16) << 8)
-        return np.ascontiguousarray(z_m, np.float32), is_object[ids]
+        return _decode(self._ids, self._inverse_z, is_object)
+
+
+@numba.njit(nogil=True, cache=True)
+def _decode(ids: np.ndarray, inverse_z: np.ndarray, is_object: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return z (H, W) [m] and the object's mask (H, W) from OpenGL's buffers, which start at the bottom row.
+
+    The depth buffer is reversed: d = near·(far − z) / (z·(far − near)); 0 is the far plane, where nothing was drawn.
+    Compiled and without the GIL, so that a servo in the same process is not held up.
+    """
+    height, width = inverse_z.shape
+    z_m, mask = np.zeros((height, width), np.float32), np.zeros((height, width), np.bool_)
+    for v in range(height):
+        row = height - 1 - v
+        for u in range(width):
+            if inverse_z[row, u] > 0.0:
+                z_m[v, u] = _NEAR_M * _FAR_M / (_NEAR_M + inverse_z[row, u] * (_FAR_M - _NEAR_M))
+            mask[v, u] = is_object[ids[row, u, 0] + 256 * ids[row, u, 1]]
+    return z_m, mask
 
 
 def make_context(model: mujoco.MjModel, width: int, height: int, samples: int) -> mujoco.MjrContext:

@@ -15,7 +15,7 @@ GROUP_SCENE = 0
 GROUP_VISUAL = 1
 """The arm's full meshes: seen from outside only."""
 GROUP_ARM = 3
-"""The arm's convex pieces: what collides and what the wrist camera sees (true to the mesh within 0.6 mm at the jaws)."""
+"""The arm's convex pieces: they collide, and the wrist camera sees them (within 0.6 mm of the mesh at the jaws)."""
 GROUP_MOUNT = 4
 """Camera housing and bracket: seen from outside only, as the lens sits behind its own glass."""
 

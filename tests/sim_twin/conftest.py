@@ -1,0 +1,11 @@
+"""Worlds that several tests look at without changing them."""
+
+import pytest
+
+from sim_twin.scene import SceneConfig
+from sim_twin.world import World
+
+
+@pytest.fixture(scope="session")
+def world() -> World:
+    return World(SceneConfig())
