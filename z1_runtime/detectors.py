@@ -66,23 +66,24 @@ class TruthDetector:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OwnGripper:
-    """The part of the image's space that the robot's own jaws may fill, fixed to the camera."""
+    """The part of the image's space that the robot's own jaws may fill, fixed to the camera.
+
+    The camera's place is the nominal one; the margin covers its calibration.
+    """
 
     lower_m: tuple[float, float, float] = (-0.10, -0.055, -0.050)
     """Lower corner in the flange frame [m]."""
     upper_m: tuple[float, float, float] = (0.212, 0.055, 0.112)
     """Upper corner in the flange frame [m]: what the meshes sweep over the whole jaw range, and 12 mm."""
-    T_flange_camera: np.ndarray = field(default_factory=lambda: T_FLANGE_CAMERA)
-    """(4, 4) hand-eye transform; nominal by default, the margin covers its calibration."""
 
     def contains(self, points: np.ndarray) -> np.ndarray:
         """Return the (N,) bool points (camera frame) that may be the robot itself."""
         # The jaws end 0.23 m from the camera, so most of a scene need not be transformed to be cleared.
         inside = np.zeros(len(points), bool)
-        corner = np.abs(np.array([self.lower_m, self.upper_m]) - self.T_flange_camera[:3, 3]).max(axis=0)
+        corner = np.abs(np.array([self.lower_m, self.upper_m]) - T_FLANGE_CAMERA[:3, 3]).max(axis=0)
         near = np.flatnonzero(points[:, 2] < np.linalg.norm(corner))
         inside[near] = inside_box(
-            transform(self.T_flange_camera, points[near]), np.array(self.lower_m), np.array(self.upper_m)
+            transform(T_FLANGE_CAMERA, points[near]), np.array(self.lower_m), np.array(self.upper_m)
         )
         return inside
 
@@ -93,8 +94,8 @@ class TabletopConfig:
 
     d_max_m: float = 1.0
     """Depth beyond this is ignored [m]."""
-    workspace_lower_m: tuple[float, float, float] = (0.28, -0.30, 0.005)
-    """Lower corner of where objects may be, base frame [m]."""
+    workspace_lower_m: tuple[float, float, float] = (0.28, -0.30, 0.0)
+    """Lower corner of where objects may be [m]: x and y in the base frame, the third is height above the table."""
     workspace_upper_m: tuple[float, float, float] = (0.70, 0.30, 0.40)
     """Upper corner [m]."""
     min_height_m: float = 0.005
@@ -138,6 +139,7 @@ class TabletopDetector:
         points = back_project(frame.depth_m, frame.intrinsics, seen)
         table = fit_table(points, expected_table(T_base_camera), config.table)
         p_base = transform(T_base_camera, points)
+        p_base[:, 2] = table.plane.height_m(points)  # a table off z = 0, or a hand-eye error, shall not matter
         standing = inside_box(p_base, np.array(config.workspace_lower_m), np.array(config.workspace_upper_m))
         standing &= table.above(points, config.min_height_m) & ~config.own.contains(points)
         index = np.flatnonzero(standing)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from tabletop_scene import INTRINSICS, Box, Cylinder, T_base_camera, cast, d405, frame_of, noisy_frame, truth
 
+from hal.z1 import T_FLANGE_CAMERA
 from z1_runtime.cloud import PerceptionError
 from z1_runtime.detectors import OwnGripper, TabletopDetector, TruthDetector, make_detector, mask_box
 from z1_runtime.table import NoTableError
@@ -39,6 +40,15 @@ def test_an_object_is_found_as_one_with_a_mask_that_fits(target, seed):
     assert found[0].box_px == mask_box(mask)
 
 
+@pytest.mark.parametrize(("tilt_rad", "lift_m"), [(0.02, 0.0), (-0.03, -0.01), (0.0, 0.02)])
+def test_a_table_that_is_not_quite_where_it_should_be_changes_nothing(tilt_rad, lift_m):
+    target = Box(0.45, 0.0, (0.06, 0.1, 0.18), 0.4, bottom_m=lift_m + 0.45 * np.tan(tilt_rad))
+    frame = noisy_frame([target], tilt_rad=tilt_rad, lift_m=lift_m)
+    found = TabletopDetector().detect(frame, T_base_camera())
+    assert len(found) == 1
+    assert iou(found[0].mask, truth(frame)) >= 0.9
+
+
 def test_the_robots_own_jaws_are_not_an_object():
     seen = TabletopDetector().detect(noisy_frame([JAWS]), T_base_camera())
     assert seen == []
@@ -50,7 +60,7 @@ def test_the_robots_own_jaws_are_not_an_object():
 
 def test_the_own_gripper_region_ends_past_the_fingertips_and_holds_no_object():
     own = OwnGripper()
-    T_camera_flange = np.linalg.inv(own.T_flange_camera)
+    T_camera_flange = np.linalg.inv(T_FLANGE_CAMERA)
     flange = np.array([[0.2, 0.0, 0.0], [0.12, 0.0, 0.1], [0.23, 0.0, 0.0], [0.15, 0.1, 0.0]])
     points = flange @ T_camera_flange[:3, :3].T + T_camera_flange[:3, 3]
     assert own.contains(points).tolist() == [True, True, False, False]
