@@ -234,6 +234,17 @@ class CollisionChecker:
         return np.concatenate([_moved(T_base_pivot, self._shape.fixed), _moved(T_base_mover, self._shape.mover)])
 
 
+def warm_up() -> None:
+    """Load what is compiled and what is read from meshes, so that the first plan is as fast as the next."""
+    pose, point = np.eye(4)[None], np.zeros((1, 3))
+    index = SceneIndex(point)
+    index.first_hits(pose, gripper_shape().fixed[:1], 0.0)
+    index.near(point, 0.0)
+    ends = np.zeros((1, 1, 2, 3))
+    _first_capsule_hit(pose, point, ends, np.zeros(1))
+    _first_capsule_pair(ends, np.zeros(1), np.zeros((1, 2), dtype=np.int64))
+
+
 def plane_in_base(plane: Plane, T_base_camera: np.ndarray) -> Plane:
     """Return a camera-frame plane in the base frame."""
     normal = T_base_camera[:3, :3] @ plane.normal

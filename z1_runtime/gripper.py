@@ -50,8 +50,10 @@ class BeakConfig:
     generators reach past them. The beak's own tips then pass the contacts by some 20 mm [m]."""
     knee_past_m: float = 0.003
     """How far the knees go beyond the contact axis along the approach; a little beyond pulls the object in [m]."""
+    max_setback_m: float = 0.025
+    """How far before the asked contacts an object that reaches deep into the hand may be held instead [m]."""
     palm_clearance_m: float = 0.005
-    """Free space between the palm and an object as deep as it is wide [m]."""
+    """Free space between the palm and the object [m]."""
     stator_clearance_m: float = 0.003
     """Gap between the fixed jaw and the object while approaching [m]."""
     opening_clearance_m: float = 0.012
@@ -145,7 +147,8 @@ class BeakGripper:
         deep = "" if front_m is None else f" and reaches {front_m * 1e3:.0f} mm from the contacts towards the palm"
         return (
             f"the object is {width_m * 1e3:.0f} mm wide{deep}; with a friction coefficient of {self.config.friction} "
-            f"the beak holds a round one of up to {self.max_width_m * 1e3:.0f} mm."
+            f"the beak holds a round one of up to {self.max_width_m * 1e3:.0f} mm, and one that reaches deep into the hand "
+            f"up to {self.config.max_setback_m * 1e3:.0f} mm nearer its front than asked."
         )
 
     def fit_batch(
@@ -157,7 +160,7 @@ class BeakGripper:
         fronts = 0.5 * widths if fronts_m is None else fronts_m
         lay = _lay_around(widths, fronts, self.config)
         T_grasp_pivot = _grasp_to_pivot(lay.centre, lay.tilt)
-        T_grasp_pivot[:, 2, 3] -= self.config.contact_depth_m
+        T_grasp_pivot[:, 2, 3] -= self.config.contact_depth_m + lay.setback_m
         flip = np.diag([-1.0, -1.0, 1.0, 1.0])
         return BeakBatch(
             T_base_pivots=np.stack([T_base_grasps @ T_grasp_pivot, T_base_grasps @ flip @ T_grasp_pivot], axis=1),
@@ -167,7 +170,8 @@ class BeakGripper:
         )
 
     def _fits(self, lay: _Lay) -> np.ndarray:
-        return (lay.squeeze_out <= self._steepest) & (lay.opened <= -z1.GRIPPER_OPEN)
+        held = (lay.squeeze_out <= self._steepest) & (lay.setback_m <= self.config.max_setback_m)
+        return held & (lay.opened <= -z1.GRIPPER_OPEN)
 
 
 def mover_pose(jaw: float | np.ndarray) -> np.ndarray:
@@ -193,12 +197,15 @@ class _Lay(NamedTuple):
     """(N,) angle of the approach axis from x towards z [rad]."""
     squeeze_out: np.ndarray
     """(N,) half the angle between the two contacts' pushes, positive outwards [rad]."""
+    setback_m: np.ndarray
+    """(N,) how far before the contact axis the disc lies, so that the palm stays clear of the object [m]."""
 
 
 def _lay_around(widths: np.ndarray, fronts: np.ndarray, config: BeakConfig) -> _Lay:
     r = 0.5 * widths
     knees = np.sqrt(np.maximum(KNEE_RADIUS_M**2 - r**2, 0.0)) - np.minimum(config.knee_past_m, _MOST_PAST * r)
-    distance = np.maximum(knees, PALM_RADIUS_M + config.palm_clearance_m + fronts)
+    palm_m = PALM_RADIUS_M + config.palm_clearance_m
+    distance = np.maximum(knees, palm_m + np.minimum(fronts, r))
     above, below = _bearing(STATOR_FACE, distance, r, 1.0), _bearing(MOVER_FACE, distance, r, -1.0)
     contact = above - below
     centre = _polar(distance, above)
@@ -210,14 +217,14 @@ def _lay_around(widths: np.ndarray, fronts: np.ndarray, config: BeakConfig) -> _
     push = np.sum((2.0 * centre - on_stator - on_mover) * along, axis=1)
     above_open = _bearing(STATOR_FACE, distance, r + config.stator_clearance_m, 1.0)
     below_open = _bearing(MOVER_FACE, distance, r + config.opening_clearance_m, -1.0)
-    # Parallel sides that reach back to the knees want their distance there, whatever a disc would leave
-    flat = 2.0 * np.arcsin(np.minimum((r + 0.5 * config.opening_clearance_m) / KNEE_RADIUS_M, 1.0))
     return _Lay(
         contact=contact,
-        opened=np.maximum(above_open - below_open, flat),
+        opened=above_open - below_open,
         centre=_polar(distance, above_open),
         tilt=np.arctan2(along[:, 1], along[:, 0]),
         squeeze_out=np.arctan2(push, widths),
+        # What reaches further towards the palm than it is thick is held where there is room, nearer its front
+        setback_m=np.maximum(knees, palm_m + fronts) - distance,
     )
 
 

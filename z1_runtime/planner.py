@@ -15,7 +15,7 @@ import numpy as np
 
 from hal import z1
 from models.types import GraspSet
-from z1_runtime.collision import CollisionChecker, CollisionConfig, Problem
+from z1_runtime.collision import CollisionChecker, CollisionConfig, Problem, warm_up
 from z1_runtime.gripper import BeakBatch, BeakConfig, BeakGripper
 from z1_runtime.kinematics import Kinematics
 from z1_runtime.trajectory import MotionLimits, PathFailure, gripper_move, joint_path, straight_move
@@ -96,7 +96,7 @@ class _Way:
     """[rad]"""
 
 
-class _Refused(Exception):  # noqa: N818 - part of the normal course
+class _Refused(Exception):
     def __init__(self, reason: str, detail: str) -> None:
         super().__init__(detail)
         self.reason = reason
@@ -112,6 +112,7 @@ class GraspPlanner:
         self.gripper = BeakGripper(self.config.beak)
         self._kinematics = kinematics
         self._limits = limits or MotionLimits()
+        warm_up()
 
     def plan(
         self, ranked: GraspSet, observation: Observation, q_start: np.ndarray, timer: StageTimer | None = None
@@ -172,9 +173,8 @@ class GraspPlanner:
             for standoff_m in dict.fromkeys((self.config.standoff_m, self.config.short_standoff_m)):
                 T_pre = _shifted(way.T_base_pivot, -standoff_m * way.T_base_grasp[:3, 2])
                 with timer("ik"):
-                    branches = self._branches(T_pre, way)
-                if not branches:
-                    refusal = _Refused("ik", f"no joints reach {_place(T_pre)}, {standoff_m * 1e3:.0f} mm before it.")
+                    branches, refusal = self._branches(T_pre, way)
+                if refusal is not None:
                     furthest = furthest or (0, refusal)
                 for q_arm in branches:
                     try:
@@ -189,14 +189,17 @@ class GraspPlanner:
         assert furthest is not None
         raise furthest[1]
 
-    def _branches(self, T_pre: np.ndarray, way: _Way) -> list[np.ndarray]:
-        """Return pre-grasp joints (6,), nearest to home first, if grasp and lifted pose can be reached at all."""
+    def _branches(self, T_pre: np.ndarray, way: _Way) -> tuple[list[np.ndarray], _Refused | None]:
+        """Return pre-grasp joints (6,), nearest to home first, or which of the three poses is out of reach."""
         T_lifted = _shifted(way.T_base_pivot, np.array([0.0, 0.0, self.config.lift_m]))
-        if not (self._kinematics.solve(way.T_base_pivot) and self._kinematics.solve(T_lifted)):
-            return []
-        branches = self._kinematics.solve(T_pre)
+        branches: list[np.ndarray] = []
+        for name, T in (("grasp", way.T_base_pivot), ("lifted pose", T_lifted), ("pre-grasp", T_pre)):
+            branches = self._kinematics.solve(T)
+            if not branches:
+                x, y, z = T[:3, 3]
+                return [], _Refused("ik", f"no joints reach the {name}, the pivot at ({x:.3f}, {y:.3f}, {z:.3f}) m.")
         branches.sort(key=lambda q: float(np.sum((q - z1.Q_HOME) ** 2)))
-        return branches[: self.config.max_branches]
+        return branches[: self.config.max_branches], None
 
     def _motion(
         self, way: _Way, T_pre: np.ndarray, q_arm: np.ndarray, checker: CollisionChecker, q_start: np.ndarray
@@ -227,7 +230,7 @@ class GraspPlanner:
         near_m = checker.config.transfer_threshold_m
         first: Problem | None = None
         for via in self._detours(q_pre, T_pre):
-            transfer = joint_path([q_start, *via, q_pre], self._limits)
+            transfer = joint_path(np.array([q_start, *via, q_pre]), self._limits)
             problem = checker.check_trajectory(transfer, threshold_m=near_m, object_threshold_m=near_m)
             if problem is None:
                 return transfer
@@ -314,7 +317,7 @@ class _Fitted:
                 self.widths_m[rank] = seen_m if np.isfinite(seen_m) else self._config.fallback_width_m
             between &= np.abs(y) < 0.5 * self.widths_m[rank] + 0.005
             # A percentile, not the nearest point: one speckle would push the whole hand back
-            front_m = -np.percentile(z[between], 2.0) - depth_m if between.any() else 0.0
+            front_m = -np.percentile(z[between], 1.0) - depth_m if between.any() else 0.0
             self._fronts_m[rank] = max(front_m, 0.0)
 
 
@@ -327,11 +330,6 @@ def _shifted(T: np.ndarray, by: np.ndarray) -> np.ndarray:
     T = T.copy()
     T[:3, 3] += by
     return T
-
-
-def _place(T: np.ndarray) -> str:
-    x, y, z = T[:3, 3]
-    return f"the pivot pose at ({x:.3f}, {y:.3f}, {z:.3f}) m"
 
 
 def _explain(n: int, rejections: list[Rejection]) -> str:
