@@ -138,7 +138,7 @@ class AntipodalSampler:
         )
 
     def _test_hands(self, hands: _Hands, cloud: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return for each hand how many points (H,) its fingers and palm hit, and how many (H,) lie between the pads."""
+        """Return how many points (H,) the fingers and palm of each hand hit, and how many (H,) lie between its pads."""
         config = self.config
         hits, held = np.zeros((2, len(hands.widths)), dtype=np.int64)
         half_pad = config.finger_width_m / 2.0
@@ -197,8 +197,10 @@ def _antipodal_pairs(surfels: Surfels, config: AntipodalConfig) -> tuple[np.ndar
     own = np.sum(normals * points, axis=1)
     along = (normals @ points.T - own[:, None]) / distance  # cos between n_i and the line from i to j
     cosine = np.cos(config.cone_rad)
-    opposed = (along < -cosine) & (along.T < -cosine)
-    return np.nonzero(opposed & (distance > config.min_width_m) & (distance < config.max_width_m))
+    faces_line = along < -cosine
+    fits = (distance > config.min_width_m) & (distance < config.max_width_m)
+    first, second = np.nonzero(faces_line & faces_line.T & fits)
+    return first, second
 
 
 def _square_up(surfels: Surfels, first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -11,6 +11,7 @@ _COARSE_CELL_M = 5e-3
 _FINE_CELL_M = 2e-3
 _MAX_CELLS_A_SIDE = 500
 _ROUND_CONTRAST = 0.7  # median over best closeness: ≤ 0.63 on boxes, ≥ 0.76 on cylinders of 40–84 mm and a bottle
+_PLATEAU = 0.99
 _PLANAR_M = 1e-4
 _MAX_HULL_DIRECTIONS = 48
 
@@ -60,24 +61,28 @@ def upright_axes(points: np.ndarray, up: np.ndarray) -> np.ndarray:
         up: (3,) unit vector against gravity in the same frame.
     """
     frame = _frame_with_z(up)
-    flat = points @ frame[:, :2]
+    flat = frame[:, :2].T @ points.T  # (2, N): contiguous rows are twice as fast here
+    cells, weights = _cell_means(flat, np.ones(len(points)), _FINE_CELL_M)
     coarse = np.arange(_YAW_BINS) * (np.pi / 2 / _YAW_BINS)
-    closeness = _closeness(*_cell_means(flat, _COARSE_CELL_M), coarse)
+    closeness = _closeness(*_cell_means(cells, weights, _COARSE_CELL_M), coarse)
     if np.median(closeness) > _ROUND_CONTRAST * closeness.max():
-        yaw = np.arctan2(*flat.mean(axis=0)[::-1])
+        yaw = np.arctan2(*flat.mean(axis=1)[::-1])
     else:
-        fine = coarse[np.argmax(closeness)] + np.deg2rad(np.arange(-8, 9) * 0.125)
-        yaw = fine[np.argmax(_closeness(*_cell_means(flat, _FINE_CELL_M), fine))]
+        fine = coarse[np.argmax(closeness)] + np.deg2rad(np.arange(-12, 13) * 0.125)
+        closeness = _closeness(cells, weights, fine)
+        # Below d0 all yaws count alike: the middle of the best plateau, not its first yaw.
+        yaw = fine[closeness >= _PLATEAU * closeness.max()].mean()
     c, s = np.cos(yaw), np.sin(yaw)
     return frame @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 def _closeness(footprint: np.ndarray, weights: np.ndarray, yaws_rad: np.ndarray) -> np.ndarray:
-    """Return for each yaw (K,) the sum over points (M, 2) of weight / max(distance to the occupied sides, d0)."""
-    c, s = np.cos(yaws_rad), np.sin(yaws_rad)
+    """Return for each yaw (K,) the sum over points (2, M) of weight / max(distance to the occupied sides, d0)."""
+    c, s = np.cos(yaws_rad).astype(np.float32), np.sin(yaws_rad).astype(np.float32)
+    footprint, weights = footprint.astype(np.float32), weights.astype(np.float32)
     distances = []
     for direction in (np.stack([c, s]), np.stack([-s, c])):  # (2, K) each
-        along = direction.T @ footprint.T  # (K, M)
+        along = direction.T @ footprint  # (K, M)
         # Percentile bounds, not extremes: one flying pixel must not carry a side away.
         ends = _row_percentiles(along, (1.0, 99.0))
         to_low, to_high = np.abs(along - ends[0][:, None]), np.abs(ends[1][:, None] - along)
@@ -93,16 +98,17 @@ def _row_percentiles(rows: np.ndarray, percentile: tuple[float, float]) -> np.nd
     return np.partition(rows, ranks, axis=1)[:, ranks].T
 
 
-def _cell_means(flat: np.ndarray, cell_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """Merge points (N, 2) that share a cell: mean positions (M, 2) and counts (M,), whatever the points' order."""
-    span = np.ptp(flat, axis=0)
+def _cell_means(flat: np.ndarray, weights: np.ndarray, cell_m: float) -> tuple[np.ndarray, np.ndarray]:
+    """Merge points (2, N) that share a cell: mean positions (2, M) and summed weights (M,), in any order of points."""
+    low = flat.min(axis=1, keepdims=True)
+    span = (flat.max(axis=1, keepdims=True) - low).ravel()
     cell_m = max(cell_m, float(span.max()) / _MAX_CELLS_A_SIDE)
-    columns, rows = ((flat - flat.min(axis=0)) / cell_m).astype(np.int64).T
+    columns, rows = ((flat - low) / cell_m).astype(np.int64)
     keys = columns * (int(span[1] / cell_m) + 2) + rows
-    counts = np.bincount(keys)
-    filled = np.flatnonzero(counts)
-    sums = np.stack([np.bincount(keys, flat[:, axis])[filled] for axis in range(2)], axis=1)
-    return sums / counts[filled, None], counts[filled].astype(float)
+    sums = np.bincount(keys, weights)
+    filled = np.flatnonzero(sums)
+    means = np.stack([np.bincount(keys, row * weights)[filled] for row in flat]) / sums[filled]
+    return means, sums[filled]
 
 
 def _large_facet_normals(points: np.ndarray, hull: ConvexHull) -> np.ndarray:
