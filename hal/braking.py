@@ -6,7 +6,7 @@ import numpy as np
 from ruckig import ControlInterface, InputParameter, Ruckig, Synchronization, Trajectory
 
 from hal.limits import ServoLimits
-from hal.z1 import N_JOINTS
+from hal.z1 import CONTROL_PERIOD_S, N_JOINTS
 
 _HARDER = 1.25
 _ATTEMPTS = 10
@@ -65,6 +65,36 @@ class StopPath:
         """Return position and velocity (7,) `t_s` [s] after the stop began."""
         q, dq, _ = self._path.at_time(min(t_s, self.duration_s))
         return np.array(q), np.array(dq)
+
+
+class Chaser:
+    """Moves towards a target that may change every tick, with Ruckig's position interface."""
+
+    def __init__(self, limits: ServoLimits) -> None:
+        self._limits = limits
+        self._ruckig = Ruckig(N_JOINTS)
+        self._input = InputParameter(N_JOINTS)
+        self._input.synchronization = Synchronization.No
+        self._input.max_velocity = limits.dq_max.tolist()
+        self._input.max_acceleration = limits.ddq_max.tolist()
+        self._input.max_jerk = limits.dddq_max.tolist()
+        self._path = Trajectory(N_JOINTS)
+
+    def step(
+        self, q_target: np.ndarray, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return position, velocity and acceleration (7,) one control period after `q`, `dq`, `ddq` (7,).
+
+        They lie on the fastest way to rest at the target; one beyond the joint limits is taken as the limit.
+        """
+        limits, inp = self._limits, self._input
+        inp.current_position = q.tolist()
+        inp.current_velocity = np.clip(dq, -limits.dq_max, limits.dq_max).tolist()
+        inp.current_acceleration = np.clip(ddq, -limits.ddq_max, limits.ddq_max).tolist()
+        inp.target_position = np.clip(q_target, limits.q_min, limits.q_max).tolist()
+        self._ruckig.calculate(inp, self._path)
+        q_next, dq_next, ddq_next = self._path.at_time(CONTROL_PERIOD_S)
+        return np.array(q_next), np.array(dq_next), np.array(ddq_next)
 
 
 class Blend:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hal.braking import Blend, Brake, StopPath
+from hal.braking import Blend, Brake, Chaser, StopPath
 from hal.limits import ServoLimits
 from hal.messages import ServoMode
 from hal.playback import Playback
@@ -30,6 +30,7 @@ class Motion:
     def __init__(self, limits: ServoLimits, q: np.ndarray) -> None:
         self._limits = limits
         self._brake = Brake(limits)
+        self._chaser = Chaser(limits)
         self.mode = ServoMode.HOLDING
         """HOLDING, TRACKING or BRAKING."""
         self.reason = ""
@@ -43,13 +44,16 @@ class Motion:
         self.q = self._hold_q = q
         """(7,) last position commanded [rad]; the arm after its limits, the gripper before its squeeze limit."""
         self._dq = self._ddq = _ZERO
+        # A difference of speeds lags by half a tick, which is enough to make a chase swing about its target.
+        self._chase_ddq: np.ndarray | None = None
         self._stop_path: StopPath | None = None
         self._blend: Blend | None = None
         self._since_s = 0.0  # ticks since the stop path or the blend began
 
     def take_note(self, q: np.ndarray, dq: np.ndarray) -> None:
         """The wish of this tick became position `q` (7,) [rad]; it was to move at `dq` (7,) [rad/s]."""
-        self._ddq = (dq - self._dq) / CONTROL_PERIOD_S
+        self._ddq = (dq - self._dq) / CONTROL_PERIOD_S if self._chase_ddq is None else self._chase_ddq
+        self._chase_ddq = None
         self.q, self._dq = q, dq
 
     def begin(self, new: Playback) -> None:
@@ -81,11 +85,10 @@ class Motion:
         return q, dq
 
     def chase(self, q: np.ndarray) -> Wish:
-        """Move towards `q` (7,) [rad], at most as fast as the joints may."""
+        """Move towards `q` (7,) [rad] within the limits of speed, acceleration and jerk."""
         self.mode, self.reason, self._blend, self._stop_path = ServoMode.TRACKING, "", None, None
-        step = self._limits.dq_max * CONTROL_PERIOD_S
-        q = np.minimum(np.maximum(q, self.q - step), self.q + step)
-        return q, (q - self.q) / CONTROL_PERIOD_S
+        q, dq, self._chase_ddq = self._chaser.step(q, self.q, self._dq, self._ddq)
+        return q, dq
 
     def brake(self, reason: str) -> None:
         """Begin to stop from the present command."""
@@ -114,7 +117,8 @@ class Motion:
 
     def _join(self, q: np.ndarray, dq: np.ndarray) -> None:
         """Blend from the present command into a motion that begins with `q`, `dq`."""
-        gap, gap_rate = self.q - q, self._dq - dq
+        # The new motion begins a tick after the last command, and by then the old one would have gone on.
+        gap, gap_rate = self.q + CONTROL_PERIOD_S * self._dq - q, self._dq - dq
         self._stop_path, self._blend, self._since_s = None, None, 0.0
         if np.abs(gap).max() > 1e-9 or np.abs(gap_rate).max() > 1e-9:
             self._blend = Blend(gap, gap_rate, self._limits.ddq_max)

@@ -84,6 +84,7 @@ class Servo:
         self._done_id = 0
         self._cancel_reason = ""
         self._rearmed = False
+        self._beyond = 0
         # Written by the tick.
         self._snapshot: _Snapshot | None = None
         self._clips = 0
@@ -223,7 +224,7 @@ class Servo:
             self._playback = playback.begin(chunk, self.limits)
 
     def send(self, setpoint: ArmSetpoint, owner: str | None = None) -> ArmSetpoint:
-        """Follow one setpoint, at most `dq_max` fast; return what the limits leave of it for the next tick.
+        """Move towards one setpoint within all limits; return it clipped to the joints' limits and a tick's reach.
 
         Without another one within `send_timeout_s` the arm holds. For streams of setpoints at the servo's rate;
         anything slower is smoother as a trajectory.
@@ -241,6 +242,7 @@ class Servo:
             if old is not None and old.trajectory_id > self._done_id:
                 raise CommandRefusedError(f"trajectory {old.trajectory_id} is playing; let it end or release() it.")
             self._target = (setpoint, self.clock.now_s())
+            self._beyond += bool(((setpoint.q < self.limits.q_min) | (setpoint.q > self.limits.q_max)).any())
         allowed = clip_setpoint(self.limits, setpoint.q, setpoint.dq, snapshot.q_sent, snapshot.state.q)
         return ArmSetpoint(q=allowed.q, dq=allowed.dq)
 
@@ -299,9 +301,10 @@ class Servo:
             )
 
     def _tell_clips(self, now_s: float) -> None:
-        if self._clips != self._clips_told and now_s - self._told_s >= _WARN_EVERY_S:
-            log.warning("servo: %d setpoints were clipped to the limits.", self._clips - self._clips_told)
-            self._clips_told, self._told_s = self._clips, now_s
+        clips = self._clips + self._beyond
+        if clips != self._clips_told and now_s - self._told_s >= _WARN_EVERY_S:
+            log.warning("servo: %d setpoints were clipped to the limits.", clips - self._clips_told)
+            self._clips_told, self._told_s = clips, now_s
 
     # --- The tick -----------------------------------------------------------------------------------------------
 

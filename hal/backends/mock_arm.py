@@ -38,7 +38,7 @@ class MockArm:
         self._moved_s = 0.0
         self._connected = False
         self._faults: tuple[str, ...] = ()
-        self._frozen_s: float | None = None
+        self._frozen: ArmState | None = None
         self._blocked_q: np.ndarray | None = None
         self.drop_commands = False
         """Setpoints are lost on the way while this is set."""
@@ -57,11 +57,14 @@ class MockArm:
     def read_state(self) -> ArmState:
         self._check_connected()
         now_s = self.clock.now_s()
-        if self._frozen_s is not None and now_s - self._frozen_s > STALE_S:
-            raise HalTimeoutError(
-                f"the mock arm's newest measurement is {now_s - self._frozen_s:.3f} s old; allowed is {STALE_S} s."
-            )
         self._move(now_s)
+        if self._frozen is not None:
+            age_s = now_s - self._frozen.stamp_s
+            if age_s > STALE_S:
+                raise HalTimeoutError(
+                    f"the mock arm's newest measurement is {age_s:.3f} s old; allowed is {STALE_S} s."
+                )
+            return self._frozen
         tau = np.clip(KP * (self._target - self._q), -TAU_MAX, TAU_MAX)
         return ArmState(stamp_s=self._moved_s, q=self._q, dq=self._dq, tau=tau, faults=self._faults)
 
@@ -87,14 +90,12 @@ class MockArm:
         self._faults = words
 
     def freeze(self) -> None:
-        """Deliver no new measurement from now on."""
-        self._move(self.clock.now_s())
-        self._frozen_s = self._moved_s
+        """Deliver no new measurement from now on; the arm itself goes on."""
+        self._frozen = self.read_state()
 
     def thaw(self) -> None:
         """Undo `freeze`."""
-        self._frozen_s = None
-        self._moved_s = self.clock.now_s()
+        self._frozen = None
 
     def block(self, joint: int | None) -> None:
         """Keep this joint (0…6) where it is, whatever is sent; None lets all go."""
@@ -108,8 +109,6 @@ class MockArm:
             raise NotConnectedError("the mock arm")
 
     def _move(self, now_s: float) -> None:
-        if self._frozen_s is not None:
-            return
         dt_s = now_s - self._moved_s
         if dt_s <= 0:
             return

@@ -1,0 +1,126 @@
+"""What the conformance suite runs over: every registered backend, and what wraps one.
+
+To add one, append to `ARM_CASES` or `CAMERA_CASES`: a name and a context manager that yields an `ArmCase` or
+`CameraCase` with a device that is not connected yet.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from hal.arm import Arm
+from hal.camera import Camera
+from hal.clock import Clock, ManualClock
+from hal.registry import ARMS, CAMERAS
+from hal.servo import Servo
+
+
+@dataclass(frozen=True)
+class ArmCase:
+    """An arm under test."""
+
+    arm: Arm
+    """Not connected."""
+    clock: Clock
+    """Sleep on it to let time pass."""
+    prepare: Callable[[], None] = lambda: None
+    """Called after connect(), before the first command; a servoed arm claims its lease here."""
+    revive: Callable[[], None] = lambda: None
+    """Called after stop(), before the next command; a servoed arm is re-armed and claimed here."""
+
+
+@dataclass(frozen=True)
+class CameraCase:
+    """A camera under test."""
+
+    camera: Camera
+    """Not connected."""
+    clock: Clock
+    """By which it lives."""
+
+
+def make_backend(registry: Any, name: str) -> tuple[Any, Clock]:
+    """Return a backend on a clock that does not make the test wait, and that clock."""
+    if name in ("mock", "replay"):
+        clock = ManualClock(10.0)
+        return registry.make(name, clock=clock), clock
+    device = registry.make(name)
+    return device, device.clock
+
+
+@contextmanager
+def registered_arm(name: str) -> Iterator[ArmCase]:
+    arm, clock = make_backend(ARMS, name)
+    yield ArmCase(arm, clock)
+    arm.disconnect()
+
+
+class TickingClock:
+    """Lets time pass in control periods and ticks the servo in each, as the twin's clock does."""
+
+    def __init__(self, inner: Clock, period_s: float = 0.002) -> None:
+        self._inner = inner
+        self._period_s = period_s
+        self.servo: Servo | None = None
+        self.ticking = False
+
+    def now_s(self) -> float:
+        return self._inner.now_s()
+
+    def sleep_until(self, t_s: float) -> None:
+        while self.now_s() < t_s - 1e-9:
+            if self.servo is not None and self.ticking:
+                self.servo.tick()
+            self._inner.sleep_until(min(self.now_s() + self._period_s, t_s))
+
+
+@contextmanager
+def servoed_arm(name: str) -> Iterator[ArmCase]:
+    arm, inner = make_backend(ARMS, name)
+    clock = TickingClock(inner)
+    servo = clock.servo = Servo(arm, inner)
+
+    def prepare() -> None:
+        servo.claim("conformance")
+        clock.ticking = True
+
+    def revive() -> None:
+        servo.rearm()
+        servo.claim("conformance")
+
+    yield ArmCase(servo, clock, prepare, revive)
+    clock.ticking = False
+    servo.disconnect()
+
+
+@contextmanager
+def registered_camera(name: str) -> Iterator[CameraCase]:
+    camera, clock = make_backend(CAMERAS, name)
+    yield CameraCase(camera, clock)
+    camera.disconnect()
+
+
+ARM_CASES: list[tuple[str, Callable[[], AbstractContextManager[ArmCase]]]] = [
+    *((name, partial(registered_arm, name)) for name in ARMS.names()),
+    *((f"servo over {name}", partial(servoed_arm, name)) for name in ARMS.names()),
+]
+CAMERA_CASES: list[tuple[str, Callable[[], AbstractContextManager[CameraCase]]]] = [
+    *((name, partial(registered_camera, name)) for name in CAMERAS.names()),
+]
+
+
+def drive(case: ArmCase, make_setpoint: Callable[[], Any], duration_s: float) -> np.ndarray:
+    """Send a setpoint every control period for `duration_s` [s]; return the last one applied (7,)."""
+    end_s = case.clock.now_s() + duration_s
+    applied = None
+    while case.clock.now_s() < end_s - 1e-9:
+        applied = case.arm.send(make_setpoint()).q
+        case.clock.sleep_until(case.clock.now_s() + 0.002)
+    assert applied is not None
+    return applied

@@ -1,0 +1,589 @@
+"""The servo over a mock arm, with every fault it is there for."""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+import pytest
+from servo_bench import ARM, START, STEP, Bench, cruise, move, setpoint
+
+from hal.arm import ServoedArm
+from hal.errors import CommandRefusedError, HalTimeoutError, LeaseError, NotConnectedError, StoppedError
+from hal.messages import ServoMode, TrajectoryChunk
+from hal.z1 import CONTROL_PERIOD_S, DDQ_MAX, DQ_MAX, KP, N_ARM, N_JOINTS, Q_MAX, Q_MIN
+
+HOLDING, TRACKING, BRAKING, STOPPED = ServoMode.HOLDING, ServoMode.TRACKING, ServoMode.BRAKING, ServoMode.STOPPED
+
+
+def test_a_servo_satisfies_the_contract() -> None:
+    assert isinstance(Bench().servo, ServoedArm)
+
+
+def test_a_trajectory_is_played_to_its_end() -> None:
+    bench = Bench()
+    bench.servo.stream(move())
+    bench.run(1.1)
+    status = bench.servo.status()
+    assert (status.mode, status.finished, status.reason) == (HOLDING, True, "")
+    assert (status.trajectory_id, status.trajectory_time_s, status.buffered_s) == (1, pytest.approx(1.0), 0.0)
+    assert status.q_command[ARM] == pytest.approx((START + STEP)[ARM])
+    assert bench.arm.read_state().q[ARM] == pytest.approx((START + STEP)[ARM], abs=1e-3)
+
+
+def test_every_setpoint_lies_on_the_trajectory() -> None:
+    bench = Bench()
+    bench.servo.stream(move())
+    bench.run(1.0)
+    s = np.arange(500) * CONTROL_PERIOD_S
+    path = START + (10 * s**3 - 15 * s**4 + 6 * s**5)[:, None] * STEP
+    assert bench.commanded()[1:501, ARM] == pytest.approx(path[:, ARM], abs=1e-5)
+
+
+def test_chunks_are_joined_without_a_seam() -> None:
+    whole, pieces = Bench(), Bench()
+    whole.servo.stream(move())
+    whole.run(1.1)
+    pieces.servo.stream(move(until_s=0.3))
+    pieces.run(0.1)
+    pieces.servo.stream(move(from_s=0.3, until_s=0.6))
+    pieces.run(0.4)
+    pieces.servo.stream(move(from_s=0.6))
+    pieces.run(0.6)
+    assert pieces.servo.status().finished
+    assert pieces.commanded() == pytest.approx(whole.commanded(), abs=1e-9)
+
+
+def test_the_buffered_time_is_told() -> None:
+    bench = Bench()
+    bench.servo.stream(move(until_s=0.3))
+    assert bench.servo.status().buffered_s == pytest.approx(0.3)
+    bench.run(0.102)
+    assert bench.servo.status().buffered_s == pytest.approx(0.2)
+
+
+def test_a_late_tick_holds_the_trajectory_time_and_is_counted() -> None:
+    bench = Bench()
+    bench.servo.stream(move())
+    bench.run(0.5)
+    before = bench.servo.status()
+    bench.clock.advance(0.05)
+    bench.run(CONTROL_PERIOD_S)
+    after = bench.servo.status()
+    assert after.trajectory_time_s - before.trajectory_time_s == pytest.approx(CONTROL_PERIOD_S)
+    assert after.overruns - before.overruns == 1
+    bench.run(1.0)
+    assert bench.servo.status().finished
+    assert bench.servo.status().overruns == after.overruns
+
+
+# --- Losing the sender --------------------------------------------------------------------------------------------
+
+
+def test_a_starved_servo_brakes_and_holds() -> None:
+    bench = Bench()
+    bench.servo.stream(move(until_s=0.4))
+    bench.run(0.42)
+    assert bench.mode is BRAKING
+    bench.run_until_at_rest()
+    status = bench.servo.status()
+    assert status.mode is HOLDING
+    assert not status.finished
+    assert "ran dry at 0.400 s" in status.reason
+    held = status.q_command
+    bench.run(0.5)
+    assert bench.servo.status().q_command == pytest.approx(held, abs=1e-12)
+
+
+def test_a_dropped_trajectory_is_not_taken_up_again_but_a_new_one_is() -> None:
+    bench = Bench()
+    bench.servo.stream(move(until_s=0.4))
+    bench.run(1.0)
+    with pytest.raises(CommandRefusedError, match=r"trajectory 1 is over .*ran dry.*next one is 2"):
+        bench.servo.stream(move(from_s=0.4))
+    bench.servo.stream(move(2, start=bench.servo.status().q_command, step=-0.2 * STEP))
+    bench.run(1.2)
+    assert bench.servo.status().finished
+    assert bench.reason == ""
+
+
+def test_a_late_heartbeat_brakes() -> None:
+    bench = Bench(heartbeat_timeout_s=0.1)
+    bench.servo.stream(move())
+    bench.run(0.3, bench.servo.heartbeat)
+    assert bench.mode is TRACKING
+    bench.run(0.12)
+    assert bench.mode is BRAKING
+    assert "no heartbeat from 'test'" in bench.reason
+    bench.run_until_at_rest()
+    assert bench.mode is HOLDING
+    assert not bench.servo.status().finished
+
+
+def test_an_owner_in_this_process_needs_no_heartbeat() -> None:
+    bench = Bench()
+    bench.servo.stream(move())
+    bench.run(1.1)
+    assert bench.servo.status().finished
+
+
+def test_a_single_setpoint_is_followed_and_then_held() -> None:
+    bench = Bench()
+    goal = START + 0.1
+    bench.run(0.5, lambda: bench.servo.send(setpoint(goal)) and None)
+    assert bench.servo.status().q_command[ARM] == pytest.approx(goal[ARM])
+    assert bench.mode is TRACKING
+    bench.run(0.5)
+    assert bench.mode is HOLDING
+    assert bench.servo.status().q_command[ARM] == pytest.approx(goal[ARM], abs=1e-6)
+
+
+def test_a_sender_of_setpoints_that_falls_silent_in_motion_brakes_the_arm() -> None:
+    bench = Bench()
+    goal = START.copy()
+    goal[0] += 2.0
+    bench.servo.send(setpoint(goal))
+    bench.run(0.12)
+    assert bench.mode is BRAKING
+    bench.run_until_at_rest()
+    assert bench.servo.status().q_command[0] < goal[0] - 0.5
+
+
+# --- Stop ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_stop_brakes_at_the_next_tick_and_latches() -> None:
+    bench = Bench()
+    bench.servo.stream(move())
+    bench.run(0.5)
+    bench.servo.stop("the button")
+    with pytest.raises(StoppedError, match="the button"):
+        bench.servo.stream(move(2))
+    bench.run(CONTROL_PERIOD_S)
+    assert bench.mode is BRAKING
+    assert bench.run_until_at_rest() < 0.4
+    assert (bench.mode, bench.reason) == (STOPPED, "the button")
+    held = bench.servo.status().q_command
+    for command in (lambda: bench.servo.stream(move(2)), lambda: bench.servo.send(setpoint(START))):
+        with pytest.raises(StoppedError, match="the button"):
+            command()
+    bench.run(0.5)
+    assert bench.servo.status().q_command == pytest.approx(held, abs=1e-12)
+
+
+def test_rearming_lifts_the_stop_and_frees_the_lease() -> None:
+    bench = Bench()
+    bench.servo.stream(move())
+    bench.run(0.5)
+    bench.servo.stop()
+    bench.run(0.5)
+    bench.servo.rearm()
+    bench.run(0.1)
+    status = bench.servo.status()
+    assert (status.mode, status.owner, status.reason) == (HOLDING, "", "")
+    with pytest.raises(LeaseError):
+        bench.servo.stream(move(2))
+    bench.servo.claim("another")
+    bench.servo.stream(move(2, start=status.q_command, step=-0.2 * STEP))
+    bench.run(1.2)
+    assert bench.servo.status().finished
+
+
+def test_a_stop_clears_what_was_queued_even_when_it_is_lifted_before_the_next_tick() -> None:
+    bench = Bench()
+    bench.servo.stream(move())
+    bench.run(0.5)
+    bench.servo.stop()
+    bench.servo.rearm()
+    bench.run(CONTROL_PERIOD_S)
+    assert bench.mode is BRAKING
+    bench.run_until_at_rest()
+    assert bench.mode is HOLDING
+    assert not bench.servo.status().finished
+
+
+def test_a_stop_while_braking_goes_on_braking_and_latches() -> None:
+    bench = Bench()
+    bench.servo.stream(move(until_s=0.5))
+    bench.run(0.55)
+    assert bench.mode is BRAKING
+    bench.servo.stop("the button")
+    assert bench.run_until_at_rest() < 0.4
+    assert (bench.mode, bench.reason) == (STOPPED, "the button")
+
+
+def test_a_trajectory_stopped_before_its_first_tick_is_counted_so_that_the_next_one_is_taken() -> None:
+    bench = Bench()
+    bench.servo.stream(move())
+    bench.servo.stop()
+    bench.run(0.1)
+    assert bench.servo.status().trajectory_id == 1
+    assert bench.arm.read_state().q == pytest.approx(START, abs=1e-6)
+    bench.servo.rearm()
+    bench.servo.claim("test")
+    bench.servo.stream(move(bench.servo.status().trajectory_id + 1))
+    bench.run(1.1)
+    assert bench.servo.status().finished
+
+
+def test_a_stop_at_rest_moves_nothing() -> None:
+    bench = Bench()
+    bench.run(0.1)
+    bench.servo.stop()
+    bench.run(0.2)
+    assert bench.mode is STOPPED
+    assert bench.commanded() == pytest.approx(np.tile(START, (len(bench.sent), 1)), abs=1e-9)
+
+
+def test_releasing_the_lease_in_motion_brakes() -> None:
+    bench = Bench()
+    bench.servo.stream(move())
+    bench.run(0.5)
+    bench.servo.release()
+    bench.run(CONTROL_PERIOD_S)
+    assert bench.mode is BRAKING
+    assert "released" in bench.reason
+    bench.run_until_at_rest()
+    assert bench.servo.status().owner == ""
+
+
+# --- Braking ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("joint", range(N_ARM))
+def test_braking_from_full_speed_takes_less_than_0_4_s(joint: int) -> None:
+    bench = Bench()
+    bench.servo.stream(cruise(joint, [1, 1, -1, 1, 1, -1][joint] * 0.99 * DQ_MAX[joint], 0.5))
+    bench.run(0.5 + 2 * CONTROL_PERIOD_S)
+    assert bench.mode is BRAKING
+    assert bench.run_until_at_rest(0.4) < 0.4
+    q = bench.commanded()
+    assert (q >= Q_MIN - 1e-9).all()
+    assert (q <= Q_MAX + 1e-9).all()
+
+
+def test_braking_stays_within_speed_acceleration_and_jerk() -> None:
+    bench = Bench()
+    bench.servo.stream(move(step=0.6 * STEP, until_s=0.5))
+    bench.run(0.498)
+    begin = len(bench.sent)
+    bench.run(0.5)
+    assert "ran dry" in bench.reason
+    q = bench.commanded()[begin - 3 :, ARM]
+    speed = np.diff(q, axis=0) / CONTROL_PERIOD_S
+    acceleration = np.diff(speed, axis=0) / CONTROL_PERIOD_S
+    jerk = np.diff(acceleration, axis=0) / CONTROL_PERIOD_S
+    assert (np.abs(speed) <= DQ_MAX[ARM]).all()
+    assert (np.abs(acceleration) <= DDQ_MAX[ARM] + 1e-6).all()
+    # Sampling a jerk-limited path at 2 ms cannot show more than its jerk; the trajectory before it was smooth.
+    assert (np.abs(jerk[3:]) <= bench.servo.limits.dddq_max[ARM] + 1e-3).all()
+
+
+# --- What is refused ------------------------------------------------------------------------------------------------
+
+
+def test_a_start_away_from_the_arm_is_refused_with_figures() -> None:
+    bench = Bench()
+    far = START.copy()
+    far[2] -= 0.06
+    with pytest.raises(CommandRefusedError, match=r"starts 0\.060 rad from joint3 .* allowed is 0\.05"):
+        bench.servo.stream(move(start=far))
+    bench.run(0.1)
+    assert bench.mode is HOLDING
+
+
+def test_a_start_a_little_off_is_blended_in_without_a_jump() -> None:
+    bench = Bench()
+    near = START.copy()
+    near[0] += 0.04
+    bench.servo.stream(move(start=near))
+    bench.run(2.0)
+    q = bench.commanded()[:, ARM]
+    assert np.abs(np.diff(q, axis=0)).max() < 0.004
+    acceleration = np.diff(q, n=2, axis=0) / CONTROL_PERIOD_S**2
+    assert (np.abs(acceleration) <= 2.2 * DDQ_MAX[ARM]).all()
+    assert bench.servo.status().finished
+    assert q[-1] == pytest.approx((near + STEP)[ARM])
+
+
+def test_a_point_beyond_a_joint_limit_is_refused_with_figures() -> None:
+    step = STEP.copy()
+    step[4] = 1.5
+    with pytest.raises(CommandRefusedError, match=r"joint5 at 1\.\d+ rad .* -1\.3439 to 1\.3439"):
+        Bench().servo.stream(move(step=step))
+
+
+def test_too_much_speed_is_refused_with_figures() -> None:
+    with pytest.raises(CommandRefusedError, match=r"joint1 at .* rad/s; allowed is 3\.14"):
+        Bench().servo.stream(move(duration_s=0.4))
+
+
+def test_steps_that_imply_too_much_speed_are_refused() -> None:
+    q = np.vstack([START, START + 0.04])
+    chunk = TrajectoryChunk(trajectory_id=1, t_s=np.array([0.0, 0.01]), q=q, dq=np.zeros((2, 7)))
+    with pytest.raises(CommandRefusedError, match=r"at 4\.000 rad/s"):
+        Bench().servo.stream(chunk)
+
+
+@pytest.mark.parametrize("from_s", [0.46, 0.2])
+def test_a_gap_or_an_overlap_in_time_is_refused(from_s: float) -> None:
+    bench = Bench()
+    bench.servo.stream(move(until_s=0.4))
+    with pytest.raises(CommandRefusedError, match=r"starts at .* but 0\.4000 s is buffered"):
+        bench.servo.stream(move(from_s=from_s))
+
+
+def test_a_first_chunk_that_does_not_start_at_zero_is_refused() -> None:
+    with pytest.raises(CommandRefusedError, match="first chunk starts at 0"):
+        Bench().servo.stream(move(from_s=0.02))
+
+
+def test_more_after_the_final_chunk_is_refused() -> None:
+    bench = Bench()
+    bench.servo.stream(move())
+    with pytest.raises(CommandRefusedError, match="has had its final chunk"):
+        bench.servo.stream(move(from_s=0.98))
+
+
+def test_a_stale_trajectory_is_refused() -> None:
+    bench = Bench()
+    bench.servo.stream(move(5))
+    with pytest.raises(CommandRefusedError, match="next one is 6 or more"):
+        bench.servo.stream(move(4))
+
+
+def test_what_is_no_chunk_and_no_setpoint_is_refused() -> None:
+    bench = Bench()
+    with pytest.raises(CommandRefusedError, match="TrajectoryChunk, not a list"):
+        bench.servo.stream([1, 2, 3])  # type: ignore[arg-type]
+    with pytest.raises(CommandRefusedError, match="ArmSetpoint, not a str"):
+        bench.servo.send("up")  # type: ignore[arg-type]
+
+
+def test_a_setpoint_while_a_trajectory_plays_is_refused() -> None:
+    bench = Bench()
+    bench.servo.stream(move())
+    with pytest.raises(CommandRefusedError, match="trajectory 1 is playing"):
+        bench.servo.send(setpoint(START))
+
+
+def test_nothing_works_before_connect() -> None:
+    bench = Bench()
+    bench.servo.disconnect()
+    for use in (
+        bench.servo.tick,
+        bench.servo.status,
+        lambda: bench.servo.claim("x"),
+        lambda: bench.servo.stream(move()),
+    ):
+        with pytest.raises(NotConnectedError):
+            use()
+
+
+def test_a_refused_chunk_leaves_the_running_trajectory_alone() -> None:
+    bench = Bench()
+    bench.servo.stream(move())
+    bench.run(0.5)
+    with pytest.raises(CommandRefusedError):
+        bench.servo.stream(move(2))
+    bench.run(0.6)
+    assert bench.servo.status().finished
+
+
+# --- Replacement ----------------------------------------------------------------------------------------------------
+
+
+def test_a_trajectory_replaced_in_motion_goes_over_without_a_jump() -> None:
+    bench = Bench()
+    bench.servo.stream(move())
+    bench.run(0.5)
+    here = bench.servo.status().q_command
+    back = np.zeros(N_JOINTS)
+    back[0] = -0.3
+    bench.servo.stream(move(2, start=here, step=back))
+    begin = len(bench.sent)
+    bench.run(2.5)
+    q = bench.commanded()[begin - 3 :, ARM]
+    speed = np.diff(q, axis=0) / CONTROL_PERIOD_S
+    assert np.abs(speed).max() < 2.0
+    assert np.abs(np.diff(speed, axis=0)).max() < 0.05  # the command's speed has no step
+    status = bench.servo.status()
+    assert (status.trajectory_id, status.finished) == (2, True)
+    assert status.q_command[ARM] == pytest.approx((here + back)[ARM], abs=1e-6)
+
+
+# --- Lease ----------------------------------------------------------------------------------------------------------
+
+
+def test_only_the_owner_commands() -> None:
+    bench = Bench()
+    with pytest.raises(LeaseError, match="'test'"):
+        bench.servo.claim("another")
+    with pytest.raises(LeaseError, match="'test', not by 'another'"):
+        bench.servo.stream(move(), owner="another")
+    with pytest.raises(LeaseError, match="'test', not by 'another'"):
+        bench.servo.heartbeat("another")
+    bench.servo.release("another")
+    assert bench.servo.status().owner == "test"
+    bench.servo.claim("test")
+    bench.servo.stream(move(), owner="test")
+
+
+def test_nobody_commands_without_a_lease() -> None:
+    bench = Bench()
+    bench.servo.release()
+    for command in (lambda: bench.servo.stream(move()), lambda: bench.servo.send(setpoint(START))):
+        with pytest.raises(LeaseError, match="claim"):
+            command()
+
+
+def test_a_silent_lease_lapses_once_nothing_moves() -> None:
+    bench = Bench(heartbeat_timeout_s=0.1)
+    bench.servo.stream(move())
+    bench.run(0.4, bench.servo.heartbeat)
+    bench.run(0.9)
+    with pytest.raises(LeaseError):
+        bench.servo.claim("another")
+    bench.run(0.2)
+    assert bench.servo.status().owner == ""
+    bench.servo.claim("another")
+    assert bench.servo.status().owner == "another"
+    with pytest.raises(LeaseError):
+        bench.servo.heartbeat("test")
+
+
+# --- Faults ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_fault_of_the_arm_brakes_and_latches() -> None:
+    bench = Bench()
+    bench.servo.stream(move())
+    bench.run(0.5)
+    bench.arm.inject_fault("overheat joint 2")
+    bench.run(CONTROL_PERIOD_S)
+    assert bench.mode is BRAKING
+    bench.run_until_at_rest()
+    assert (bench.mode, bench.reason) == (STOPPED, "the arm reports overheat joint 2")
+    bench.servo.rearm()
+    bench.run(0.01)
+    assert bench.mode is STOPPED, "the fault is still there"
+    bench.arm.inject_fault()
+    bench.servo.rearm()
+    bench.run(0.01)
+    assert bench.mode is HOLDING
+
+
+def test_a_blocked_joint_latches_and_the_arm_gives_way() -> None:
+    bench = Bench()
+    bench.servo.stream(move())
+    bench.run(0.2)
+    bench.arm.block(0)
+    bench.run(1.5)
+    status = bench.servo.status()
+    assert status.mode is STOPPED
+    assert "joint1 has been at its torque limit" in status.reason
+    assert status.q_command[0] == pytest.approx(bench.arm.read_state().q[0], abs=1e-3)
+
+
+def test_lost_commands_are_noticed_as_a_joint_that_does_not_follow() -> None:
+    bench = Bench()
+    bench.arm.drop_commands = True
+    bench.servo.stream(move())
+    bench.run(1.5)
+    assert bench.mode is STOPPED
+    assert "from its command" in bench.reason
+
+
+def test_a_motor_at_its_torque_limit_for_long_latches() -> None:
+    bench = Bench()
+    bench.arm.offset[1] = 0.12  # less than a following error, but more than 60 Nm
+    bench.run(0.08)
+    assert bench.mode is HOLDING
+    bench.run(0.2)
+    assert bench.mode is STOPPED
+    assert "joint2 has been at its torque limit" in bench.reason
+
+
+def test_an_arm_that_falls_silent_is_braked_blind_and_latched() -> None:
+    bench = Bench()
+    bench.servo.stream(move())
+    bench.run(0.5)
+    bench.arm.freeze()
+    bench.run(0.11)
+    assert bench.mode is BRAKING
+    assert "state is lost" in bench.reason
+    bench.run_until_at_rest()
+    assert bench.mode is STOPPED
+    with pytest.raises(HalTimeoutError):
+        bench.servo.read_state()
+    bench.arm.thaw()
+    bench.servo.rearm()
+    bench.run(0.5)
+    assert bench.mode is HOLDING
+
+
+def test_an_arm_that_takes_no_commands_is_latched_and_left_alone() -> None:
+    bench = Bench()
+    bench.servo.stream(move())
+    bench.run(0.5)
+    bench.arm.refuse_commands = True
+    bench.run(1.0)
+    assert bench.mode is STOPPED
+    assert "takes no commands" in bench.reason
+    bench.arm.refuse_commands = False
+    stuck = bench.servo.status().q_command
+    bench.run(0.1)
+    assert bench.servo.status().q_command == pytest.approx(stuck)
+    bench.servo.rearm()
+    bench.run(0.5)
+    assert bench.mode is HOLDING
+    assert bench.reason == ""
+
+
+# --- Limits ---------------------------------------------------------------------------------------------------------
+
+
+def test_the_gripper_squeezes_with_a_bounded_torque_and_keeps_squeezing() -> None:
+    bench = Bench()
+    close = np.zeros(N_JOINTS)
+    close[N_ARM] = 0.5
+    bench.servo.stream(move(step=close))
+    bench.run(0.3)
+    bench.arm.block(N_ARM)
+    bench.run(1.0)
+    status = bench.servo.status()
+    assert (status.mode, status.finished) == (HOLDING, True)
+    tau = bench.arm.read_state().tau
+    assert tau[N_ARM] == pytest.approx(3.0, rel=1e-6)
+    bench.servo.stop()
+    bench.run(0.5)
+    assert bench.arm.read_state().tau[N_ARM] == pytest.approx(3.0, rel=1e-6)
+
+
+@pytest.mark.parametrize("grip", ["as wished", "as sent"])
+def test_a_motion_with_a_held_object_starts_from_the_gripper_command(grip: str) -> None:
+    bench = Bench()
+    close = np.zeros(N_JOINTS)
+    close[N_ARM] = 0.5
+    bench.servo.stream(move(step=close))
+    bench.run(0.3)
+    bench.arm.block(N_ARM)
+    bench.run(1.0)
+    start = bench.servo.status().q_command.copy()
+    start[N_ARM] = 0.0 if grip == "as wished" else start[N_ARM]
+    lift = 0.3 * STEP
+    lift[N_ARM] = 0.0
+    bench.servo.stream(move(2, start=start, step=lift))
+    bench.run(1.2)
+    assert bench.servo.status().finished
+    assert KP[N_ARM] * (bench.servo.status().q_command - bench.arm.read_state().q)[N_ARM] > 2.9
+
+
+def test_clipping_is_told_once_a_second(caplog: pytest.LogCaptureFixture) -> None:
+    bench = Bench()
+    beyond = START.copy()
+    beyond[4] = Q_MAX[4] + 0.5
+    with caplog.at_level(logging.WARNING, logger="hal.servo"):
+        bench.run(2.5, lambda: bench.servo.send(setpoint(beyond)) and None)
+    assert 2 <= len(caplog.records) <= 3
+    assert "clipped" in caplog.text
