@@ -9,7 +9,8 @@ import tyro
 
 from hal.bus.client import RemoteArm
 from hal.bus.session import BusConfig
-from scripts.stop_arm import describe
+from hal.messages import ServoMode
+from scripts.stop_arm import describe, wait_for_mode
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,12 +24,13 @@ Config = RearmConfig
 
 
 def main(config: RearmConfig) -> int:
-    """Re-arm and print what the servo says.
+    """Re-arm and print what the servo says; return 1 if the stop was latched again at once.
 
     Raises:
         HalTimeoutError: no HAL process answers.
     """
     with RemoteArm(config.bus, owner="rearm command") as arm:
         arm.rearm()
-        print(describe(arm.status()))
-    return 0
+        status = wait_for_mode(arm.status, ServoMode.HOLDING)
+    print(describe(status))
+    return 1 if status.mode is ServoMode.STOPPED else 0

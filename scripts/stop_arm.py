@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Annotated
 
@@ -12,7 +14,7 @@ from hal.bus.codec import decode
 from hal.bus.link import Link
 from hal.bus.session import BusConfig
 from hal.clock import WallClock
-from hal.messages import ServoStatus
+from hal.messages import ServoMode, ServoStatus
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,6 +28,8 @@ class StopConfig:
 
 Config = StopConfig
 
+_BRAKING_S = 2.0
+
 
 def main(config: StopConfig) -> int:
     """Stop the arm and print what the servo says.
@@ -37,11 +41,24 @@ def main(config: StopConfig) -> int:
     link = Link(config.bus, WallClock(), "the arm")
     try:
         link.ask(keys.STOP, config.reason.encode(), "stop command")
-        print(describe(decode(link.ask(keys.READ_STATUS), ServoStatus)))
+        status = wait_for_mode(lambda: decode(link.ask(keys.READ_STATUS), ServoStatus), ServoMode.STOPPED)
     finally:
         link.close()
+    print(describe(status))
+    if status.mode is not ServoMode.STOPPED:
+        print("error: the arm has not come to rest; use the switch on the arm.", file=sys.stderr)
+        return 1
     print("nothing moves until somebody has looked at the arm and typed: ./z1 rearm")
     return 0
+
+
+def wait_for_mode(read: Callable[[], ServoStatus], mode: ServoMode) -> ServoStatus:
+    """Return the first status that shows `mode`, or the newest one when that takes longer than a braking arm may."""
+    clock = WallClock()
+    give_up_s = clock.now_s() + _BRAKING_S
+    while (status := read()).mode is not mode and clock.now_s() < give_up_s:
+        clock.sleep_until(clock.now_s() + 0.01)
+    return status
 
 
 def describe(status: ServoStatus) -> str:
