@@ -112,7 +112,6 @@ class AntipodalSampler:
             normals=np.concatenate(
                 [smooth_normals(at, estimate_normals(tree, at)), smooth_normals(hidden.points, hidden.normals)]
             ),
-            visible=np.concatenate([np.ones(len(at), dtype=bool), hidden.visible]),
         )
 
     def _draw_hands(self, surfels: Surfels, points: np.ndarray, count: int, rng: np.random.Generator) -> _Hands:

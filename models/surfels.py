@@ -8,6 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 _NORMAL_NEIGHBORS = 30
+_MIN_DEPTH_M = 1e-3
 _OUTLINE_NEIGHBORS = 12
 _OUTLINE_GAP_RAD = np.deg2rad(125.0)  # an inner pixel's neighbours leave no gap above 90°
 _EDGE_NEIGHBORS = 40
@@ -29,8 +30,6 @@ class Surfels:
     """(K, 3) [m]."""
     normals: np.ndarray
     """(K, 3) outward unit normals, estimated or guessed."""
-    visible: np.ndarray
-    """(K,) bool, false where the surface is hidden and only its outline was seen."""
 
 
 def estimate_normals(tree: cKDTree, at: np.ndarray) -> np.ndarray:
@@ -49,9 +48,17 @@ def find_outline(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     A point is on the outline if its neighbours in the image leave a wide empty sector; `outward` is the unit vector
     into that sector, square to the view ray. On a smooth body it is the surface's normal there, for the ray grazes
     the surface. Corners are left out: their outward direction is no surface's normal.
+
+    Raises:
+        ValueError: points beside or behind the camera, which stands at the origin.
     """
     basis = _view_basis(points)  # (3, 3) rows: right, down, forward
     in_view = points @ basis.T
+    if in_view[:, 2].min() < _MIN_DEPTH_M:
+        raise ValueError(
+            f"The cloud reaches to {in_view[:, 2].min():.3f} m along the view; it must be seen from its origin, "
+            "all of it in front. Give it in the camera frame."
+        )
     bearings = in_view[:, :2] / in_view[:, 2:]
     tree = cKDTree(bearings)
     gaps, _ = _widest_gap(tree, bearings, _OUTLINE_NEIGHBORS)
@@ -83,6 +90,8 @@ def guess_hidden_sides(
         setback_m: how far behind an edge the pads touch [m].
     """
     at = points[rim]
+    if len(at) == 0:
+        return Surfels(points=at, normals=at)
     normals = estimate_normals(tree, at)
     square = _unit(outward - np.sum(outward * normals, axis=1, keepdims=True) * normals)
     # The probe goes inward along the surface: straight across the view it would land inside a round body.
@@ -94,7 +103,6 @@ def guess_hidden_sides(
     return Surfels(
         points=at + half_gap * outward - np.where(flat, setback_m * normals, 0.0),
         normals=np.where(flat, square, outward),
-        visible=np.zeros(len(rim), dtype=bool),
     )
 
 
@@ -103,6 +111,8 @@ def smooth_normals(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
 
     Fingers are long: 4° off the face moves their roots 3 mm, so the noise of one patch matters.
     """
+    if len(points) < 2:
+        return normals
     distances, neighbors = cKDTree(points).query(points, k=min(_SMOOTHING_NEIGHBORS, len(points)))
     near = normals[neighbors]
     alike = np.einsum("kni,ki->kn", near, normals) > np.cos(_SMOOTHING_RAD)
