@@ -91,6 +91,8 @@ class ServoThread:
             self._error = error
             log.exception("the servo's tick failed; the arm is stopped")
             self._servo.fail(f"the servo's tick failed: {type(error).__name__}: {error}")
+        finally:
+            gc.unfreeze()
 
     def _tick_for_ever(self) -> None:
         clock, tick, ended = self._clock, self._servo.tick, self._end.is_set
@@ -108,7 +110,7 @@ def _prepare(cpu: int | None) -> None:
     """Ask for what makes the calling thread punctual; go on without what is not permitted."""
     granted = []
     sys.setswitchinterval(_SWITCH_INTERVAL_S)
-    # What exists by now is never garbage; not looking at it again keeps collections short.
+    # What exists by now is no garbage while the servo runs; not looking at it keeps collections short.
     gc.freeze()
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_FIFO_PRIORITY))

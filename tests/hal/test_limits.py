@@ -1,0 +1,84 @@
+"""What the servo lets through to the arm."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hal.errors import InvalidMessageError
+from hal.limits import OverloadWatch, ServoLimits, clip_setpoint, find_blocked
+from hal.z1 import CONTROL_PERIOD_S, DQ_MAX, KP, N_ARM, N_JOINTS, Q_MAX, Q_MIN
+
+LIMITS = ServoLimits()
+MIDDLE = (Q_MIN + Q_MAX) / 2
+ZERO = np.zeros(N_JOINTS)
+
+
+def test_a_harmless_setpoint_is_let_through_as_it_is() -> None:
+    q = MIDDLE + 0.001
+    allowed = clip_setpoint(LIMITS, q, ZERO + 0.5, MIDDLE, MIDDLE)
+    assert (allowed.q == q).all()
+    assert (allowed.dq == 0.5).all()
+    assert not allowed.clipped
+
+
+def test_a_step_is_no_faster_than_the_joints() -> None:
+    allowed = clip_setpoint(LIMITS, MIDDLE + 0.5, ZERO + 9.0, MIDDLE, MIDDLE)
+    assert allowed.q == pytest.approx(MIDDLE + DQ_MAX * CONTROL_PERIOD_S)
+    assert allowed.dq[:N_ARM] == pytest.approx(DQ_MAX[:N_ARM])
+    assert allowed.clipped
+
+
+@pytest.mark.parametrize(("edge", "side"), [(Q_MIN, -1.0), (Q_MAX, 1.0)])
+def test_positions_end_at_the_joint_limits(edge: np.ndarray, side: float) -> None:
+    allowed = clip_setpoint(LIMITS, edge + side, ZERO, edge - side * 0.001, edge)
+    assert allowed.q == pytest.approx(edge)
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_the_gripper_leads_its_measurement_by_the_grip_torque_at_most(side: float) -> None:
+    wish = MIDDLE.copy()
+    wish[N_ARM] += side * 0.5
+    last = MIDDLE.copy()
+    last[N_ARM] += side * 0.022
+    allowed = clip_setpoint(LIMITS, wish, ZERO + 1.0, last, MIDDLE)
+    assert KP[N_ARM] * (allowed.q - MIDDLE)[N_ARM] == pytest.approx(side * 3.0)
+    assert allowed.dq[N_ARM] == 0.0
+    assert not allowed.clipped
+
+
+def test_an_arm_outside_its_limits_is_led_back_at_no_more_than_the_joints_speed() -> None:
+    outside = Q_MAX + 0.1
+    allowed = clip_setpoint(LIMITS, outside, ZERO, outside, outside)
+    assert allowed.q[:N_ARM] == pytest.approx((outside - DQ_MAX * CONTROL_PERIOD_S)[:N_ARM])
+
+
+def test_a_joint_that_does_not_follow_is_named() -> None:
+    command = MIDDLE.copy()
+    command[3] += 0.31
+    assert find_blocked(LIMITS, command, MIDDLE).startswith("joint4 is 0.31 rad from its command")
+    command[3] = MIDDLE[3] + 0.29
+    command[N_ARM] += 1.0
+    assert find_blocked(LIMITS, command, MIDDLE) == ""
+
+
+def test_a_motor_may_be_at_its_limit_for_a_tenth_of_a_second() -> None:
+    watch = OverloadWatch(LIMITS)
+    tau = ZERO.copy()
+    tau[2] = -30.0
+    assert [watch.update(tau) for _ in range(50)] == [""] * 50
+    assert watch.update(tau).startswith("joint3 has been at its torque limit (-30.0 Nm)")
+
+
+def test_short_peaks_of_different_motors_do_not_add_up() -> None:
+    watch = OverloadWatch(LIMITS)
+    for tick in range(300):
+        tau = ZERO.copy()
+        tau[tick // 40 % 2] = 60.0
+        assert watch.update(tau) == ""
+
+
+@pytest.mark.parametrize("options", [{"grip_torque_nm": -1.0}, {"q_min": Q_MAX}, {"dq_max": [1, 2]}])
+def test_limits_that_make_no_sense_are_refused(options: dict) -> None:
+    with pytest.raises(InvalidMessageError):
+        ServoLimits(**options)
