@@ -1,0 +1,46 @@
+"""Period statistics."""
+
+from __future__ import annotations
+
+import pytest
+
+from hal.periods import PeriodStatistics
+
+
+def test_periods_are_summed_up_only_while_they_are_measured() -> None:
+    periods = PeriodStatistics(capacity=1000)
+    for i in range(10):
+        periods.record(0.002 * i)
+    assert periods.summary_ms() == (0.0, 0.0)
+    assert (periods.ticks, periods.overruns) == (10, 0)
+
+
+def test_median_and_tail_are_those_of_the_last_periods_in_the_ring() -> None:
+    periods = PeriodStatistics(capacity=100)
+    periods.measured = True
+    now_s = 0.0
+    for step_s in [0.5] * 100 + [0.002] * 100:
+        periods.record(now_s)
+        now_s += step_s
+    periods.record(now_s)
+    assert periods.summary_ms() == pytest.approx((2.0, 2.0))
+
+
+def test_a_cycle_more_than_half_a_period_late_is_an_overrun() -> None:
+    periods = PeriodStatistics()
+    for now_s in (0.0, 0.002, 0.0049, 0.0080, 0.0100):
+        periods.record(now_s)
+    assert periods.overruns == 1
+
+
+def test_a_summary_is_kept_for_a_while() -> None:
+    periods = PeriodStatistics()
+    periods.measured = True
+    for i in range(10):
+        periods.record(0.002 * i)
+    first = periods.summary_ms()
+    periods.record(1.0)
+    assert periods.summary_ms() == first
+    for i in range(500):
+        periods.record(1.0 + 0.003 * i)
+    assert periods.summary_ms()[0] == pytest.approx(3.0)
