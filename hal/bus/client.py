@@ -1,0 +1,201 @@
+"""The runtime's end of the link: the HAL process's arm and camera, as if they were in this process."""
+
+from __future__ import annotations
+
+import threading
+import uuid
+from types import TracebackType
+from typing import Self
+
+import zenoh
+
+from hal.bus import keys
+from hal.bus.codec import decode, encode
+from hal.bus.link import Link
+from hal.bus.remote_camera import RemoteCamera as RemoteCamera  # noqa: PLC0414 (a re-export)
+from hal.bus.service import as_bytes
+from hal.bus.session import BusConfig
+from hal.clock import Clock, WallClock
+from hal.errors import HalTimeoutError, NotConnectedError
+from hal.messages import ArmSetpoint, ArmState, ServoStatus, TrajectoryChunk
+
+
+class RemoteArm:
+    """The servoed arm of a HAL process (`hal.arm.ServoedArm`).
+
+    While it holds the lease it sends the heartbeat from a thread of its own: should this process die, or hold the
+    interpreter for longer than 0.1 s in one piece, the servo brakes.
+
+    Args:
+        config: where the HAL process is.
+        owner: what this process is called; a random part is added, so that two of the same name stay two.
+        clock: the wall's.
+    """
+
+    def __init__(self, config: BusConfig | None = None, owner: str = "runtime", clock: Clock | None = None) -> None:
+        self._config = config or BusConfig()
+        self._suffix = uuid.uuid4().hex[:8]
+        self._owner = f"{owner}-{self._suffix}"
+        self._clock = clock or WallClock()
+        self._link: Link | None = None
+        self._newest: tuple[bytes, float] | None = None
+        self._arrived = threading.Event()
+        self._heart: _Heart | None = None
+
+    # --- Life -----------------------------------------------------------------------------------------------------
+
+    def connect(self) -> None:
+        """Open the link and wait for the arm's first state. Harmless when open.
+
+        Raises:
+            HalTimeoutError: no HAL process answers, or it publishes no state.
+        """
+        if self._link is not None:
+            return
+        link = Link(self._config, self._clock, "the remote arm")
+        self._newest = None
+        self._arrived.clear()
+        link.session.declare_subscriber(keys.STATE, self._take_state)
+        if not self._arrived.wait(self._config.connect_timeout_s):
+            link.close()
+            raise HalTimeoutError(
+                f"the HAL process at {self._config.endpoint} publishes no arm state; look at its log, then at the arm."
+            )
+        self._link = link
+
+    def disconnect(self) -> None:
+        """Give the lease back, if it is ours, and close the link. Harmless when not connected."""
+        link = self._link
+        if link is None:
+            return
+        try:
+            if self._heart is not None:
+                self.release()
+        except HalTimeoutError:
+            pass  # there is nobody left to give it back to, and without our heartbeat it lapses
+        finally:
+            self._stop_heart()
+            self._link = None
+            link.close()
+
+    def __enter__(self) -> Self:
+        self.connect()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.disconnect()
+
+    # --- Arm ------------------------------------------------------------------------------------------------------
+
+    def read_state(self) -> ArmState:
+        """Return the newest published measurement (up to 10 ms old; see `hal.arm.Arm.read_state`)."""
+        self._connected()
+        newest = self._newest
+        age_s = self._clock.now_s() - newest[1] if newest else float("inf")
+        if newest is None or age_s > self._config.state_max_age_s:
+            raise HalTimeoutError(
+                f"the newest arm state from {self._config.endpoint} is {age_s:.2f} s old; allowed is "
+                f"{self._config.state_max_age_s} s. The HAL process is gone or its arm is silent: look at its log."
+            )
+        return decode(newest[0], ArmState)
+
+    def send(self, setpoint: ArmSetpoint) -> ArmSetpoint:
+        """Hand over one setpoint (see `hal.arm.Arm.send`)."""
+        return decode(self._connected().ask(keys.SEND, encode(setpoint), self._name()), ArmSetpoint)
+
+    def stop(self, reason: str = "") -> None:
+        """Brake, hold, and latch, whoever holds the lease; returns when the servo has taken it.
+
+        Raises:
+            HalTimeoutError: no answer: use the switch on the arm.
+        """
+        self._connected().ask(keys.STOP, reason.encode(), self._name())
+
+    # --- Servo ----------------------------------------------------------------------------------------------------
+
+    def claim(self, owner: str = "") -> None:
+        """Take the command lease (see `hal.arm.ServoedArm.claim`) and begin the heartbeat.
+
+        Args:
+            owner: a name to show others; default is the one given at the start.
+        """
+        link = self._connected()
+        name = f"{owner}-{self._suffix}" if owner else self._owner
+        link.ask(keys.CLAIM, owner=name)
+        if self._heart is None or self._heart.owner != name:
+            self._stop_heart()
+            self._heart = _Heart(link.session, name, 1.0 / self._config.heartbeat_rate_hz)
+
+    def release(self) -> None:
+        """Give the lease back (see `hal.arm.ServoedArm.release`)."""
+        link = self._connected()
+        name = self._name()
+        try:
+            link.ask(keys.RELEASE, owner=name)
+        finally:
+            self._stop_heart()
+
+    def stream(self, chunk: TrajectoryChunk) -> None:
+        """Queue a piece of a trajectory; returns when the servo has taken it (see `hal.arm.ServoedArm.stream`)."""
+        self._connected().ask(keys.CHUNK, encode(chunk), self._name())
+
+    def status(self) -> ServoStatus:
+        """Ask the servo for its account of itself.
+
+        Asked, not remembered: after `stream()` a published one may still tell of the trajectory before.
+        """
+        return decode(self._connected().ask(keys.READ_STATUS), ServoStatus)
+
+    def rearm(self) -> None:
+        """Lift a latched stop (see `hal.arm.ServoedArm.rearm`)."""
+        self._connected().ask(keys.REARM, owner=self._name())
+        self._stop_heart()
+
+    # --- Inside ---------------------------------------------------------------------------------------------------
+
+    def _connected(self) -> Link:
+        if self._link is None:
+            raise NotConnectedError("the remote arm")
+        return self._link
+
+    def _name(self) -> str:
+        return self._heart.owner if self._heart is not None else self._owner
+
+    def _take_state(self, sample: zenoh.Sample) -> None:
+        self._newest = (as_bytes(sample.payload), self._clock.now_s())
+        self._arrived.set()
+
+    def _stop_heart(self) -> None:
+        if self._heart is not None:
+            self._heart.stop()
+            self._heart = None
+
+
+class _Heart:
+    """Says `owner` on the heartbeat key, again and again, until stopped."""
+
+    def __init__(self, session: zenoh.Session, owner: str, period_s: float) -> None:
+        self.owner = owner
+        self._period_s = period_s
+        self._publisher = session.declare_publisher(
+            keys.HEARTBEAT,
+            priority=zenoh.Priority.REAL_TIME,
+            congestion_control=zenoh.CongestionControl.DROP,
+            express=True,
+        )
+        self._end = threading.Event()
+        self._thread = threading.Thread(target=self._beat, name="bus heartbeat", daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Fall silent."""
+        self._end.set()
+        self._thread.join()
+
+    def _beat(self) -> None:
+        beat = self.owner.encode()
+        while not self._end.wait(self._period_s):
+            self._publisher.put(beat)
+        self._publisher.undeclare()

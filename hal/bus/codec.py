@@ -1,0 +1,225 @@
+"""Every message to and from bytes: a msgpack header of the plain fields, then the arrays as they lie in memory.
+
+Layout: magic `Z1`, version (1 byte), one zero byte, header length (uint32), header, arrays in field order, all
+little-endian. The header is `[type name, {field: value}]`, with an array's shape in place of its values; what type a
+field has is read from the dataclass, never from the wire, so nothing that arrives can choose what is constructed.
+"""
+
+from __future__ import annotations
+
+import inspect
+import math
+import struct
+from dataclasses import dataclass, fields, is_dataclass
+from enum import Enum
+from functools import cache
+from typing import Any, get_args, get_type_hints
+
+import msgpack
+import numpy as np
+
+import hal.messages
+from hal.errors import InvalidMessageError
+
+VERSION = 1
+MAX_BYTES = 64 * 2**20
+"""Longest message taken; a 1280×720 RGB-D frame with mask has 7.4 MB."""
+_MAX_HEADER = 64 * 2**10
+_MAX_TEXT = 2000
+_PREFIX = struct.Struct("<2sBBI")
+_MAGIC = b"Z1"
+_DTYPES = {"colour": np.dtype("|u1"), "depth_m": np.dtype("<f4"), "truth_mask": np.dtype("|b1")}
+_FLOAT = np.dtype("<f8")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Hello:
+    """What a HAL process says of itself."""
+
+    robot: str
+    """Name of the robot."""
+    versions: tuple[str, ...]
+    """`name=version` of the packages that matter to the link."""
+    now_s: float
+    """The HAL's clock at the answer [s]."""
+
+
+MESSAGES: dict[str, type] = {
+    name: kind for name, kind in inspect.getmembers(hal.messages, inspect.isclass) if is_dataclass(kind)
+} | {"Hello": Hello}
+
+
+@cache
+def _schema(kind: type) -> tuple[tuple[str, Any], ...]:
+    hints = get_type_hints(kind)
+    return tuple((field.name, hints[field.name]) for field in fields(kind))
+
+
+def _is_array(hint: Any) -> bool:
+    return hint is np.ndarray or np.ndarray in get_args(hint)
+
+
+def _plain(value: Any, hint: Any, name: str) -> Any:
+    """Return a field as what msgpack can hold."""
+    if is_dataclass(hint) and isinstance(hint, type):
+        return {key: _plain(getattr(value, key), sub, f"{name}.{key}") for key, sub in _schema(hint)}
+    if isinstance(hint, type) and issubclass(hint, Enum):
+        return value.value
+    if hint in (bool, int, float, str):
+        return hint(value)
+    if get_args(hint) == (str, ...):
+        return list(value)
+    raise TypeError(f"{name} has type {hint}, for which the codec has no rule; add one to hal/bus/codec.py.")
+
+
+def _split(message: Any) -> tuple[bytes, list[np.ndarray]]:
+    kind = type(message)
+    if MESSAGES.get(kind.__name__) is not kind:
+        raise TypeError(f"{kind.__name__} is not a message; known: {', '.join(sorted(MESSAGES))}.")
+    plain: dict[str, Any] = {}
+    arrays: list[np.ndarray] = []
+    for name, hint in _schema(kind):
+        value = getattr(message, name)
+        if not _is_array(hint):
+            plain[name] = _plain(value, hint, f"{kind.__name__}.{name}")
+        elif value is None:
+            plain[name] = None
+        else:
+            want = _DTYPES.get(name, _FLOAT)
+            if value.dtype != want:
+                raise InvalidMessageError(f"{kind.__name__}.{name} is {value.dtype}; the wire carries {want}.")
+            plain[name] = list(value.shape)
+            arrays.append(np.ascontiguousarray(value))
+    header: bytes = msgpack.packb([kind.__name__, plain])  # pyright: ignore[reportAssignmentType] (its stub is wrong)
+    return _PREFIX.pack(_MAGIC, VERSION, 0, len(header)) + header, arrays
+
+
+def encode(message: Any) -> bytes:
+    """Return `message` as bytes.
+
+    Raises:
+        TypeError: not a message, or a field type the codec does not know.
+        InvalidMessageError: an array whose dtype the wire does not carry (object arrays among them).
+    """
+    head, arrays = _split(message)
+    return b"".join([head, *(array.data.cast("B") if array.size else b"" for array in arrays)])
+
+
+def encode_into(message: Any, buffer: bytearray) -> None:
+    """Write `message` to `buffer`, whose length is adapted; each array is copied once."""
+    head, arrays = _split(message)
+    total = len(head) + sum(array.nbytes for array in arrays)
+    if len(buffer) != total:
+        buffer[:] = bytes(total)
+    buffer[: len(head)] = head
+    with memoryview(buffer) as view:
+        at = len(head)
+        for array in arrays:
+            view[at : at + array.nbytes] = array.data.cast("B")
+            at += array.nbytes
+
+
+def decode(data: bytes, kind: type | None = None) -> Any:
+    """Return the message in `data`, every field checked.
+
+    Args:
+        data: one whole message.
+        kind: the type it must have; None = any known.
+
+    Raises:
+        InvalidMessageError: anything else than one well-formed message of this version.
+    """
+    name, plain, body = _open_envelope(data)
+    if name not in MESSAGES or (kind is not None and name != kind.__name__):
+        allowed = kind.__name__ if kind else ", ".join(sorted(MESSAGES))
+        raise InvalidMessageError(f"the payload is a message of type {name[:60]!r}; allowed here: {allowed}.")
+    found = MESSAGES[name]
+    schema = _schema(found)
+    if set(plain) != {field for field, _ in schema}:
+        raise InvalidMessageError(
+            f"{name} came with the fields {sorted(map(str, plain))[:20]}; needed are {[f for f, _ in schema]}."
+        )
+    values: dict[str, Any] = {}
+    at = 0
+    for field, hint in schema:
+        label = f"{name}.{field}"
+        if not _is_array(hint):
+            values[field] = _checked(plain[field], hint, label)
+        elif plain[field] is None and hint is not np.ndarray:
+            values[field] = None
+        else:
+            values[field], at = _take_array(body, at, plain[field], _DTYPES.get(field, _FLOAT), label)
+    if at != len(body):
+        raise InvalidMessageError(f"{name} has {len(body)} bytes of arrays; its header tells of {at}.")
+    return found(**values)
+
+
+def _open_envelope(data: bytes) -> tuple[str, dict[Any, Any], memoryview]:
+    if not _PREFIX.size <= len(data) <= MAX_BYTES:
+        raise InvalidMessageError(f"the payload has {len(data)} bytes; allowed are {_PREFIX.size} to {MAX_BYTES}.")
+    magic, version, zero, length = _PREFIX.unpack_from(data)
+    if magic != _MAGIC or zero:
+        raise InvalidMessageError(f"the payload begins with {bytes(data[:8])!r}; a message begins with {_MAGIC!r}.")
+    if version != VERSION:
+        raise InvalidMessageError(f"the payload has format version {version}; this program speaks {VERSION}: update.")
+    end = _PREFIX.size + length
+    if length > _MAX_HEADER or end > len(data):
+        raise InvalidMessageError(f"the payload claims a header of {length} bytes but has {len(data)} in all.")
+    try:
+        header = msgpack.unpackb(data[_PREFIX.size : end])
+    except (ValueError, OverflowError, msgpack.UnpackException) as err:
+        raise InvalidMessageError(f"the payload's header is not msgpack: {err}.") from err
+    match header:
+        case [str(name), dict(plain)]:
+            return name, plain, memoryview(data)[end:]
+    raise InvalidMessageError(f"the payload's header is {str(header)[:80]}; expected is [type name, fields].")
+
+
+def _checked(value: Any, hint: Any, label: str) -> Any:
+    """Return a plain field as its type; nothing is converted but lists to tuples and values to enum members."""
+    if is_dataclass(hint) and isinstance(hint, type):
+        schema = _schema(hint)
+        if not isinstance(value, dict) or set(value) != {key for key, _ in schema}:
+            raise InvalidMessageError(f"{label} is {str(value)[:80]}; needed are the fields {[k for k, _ in schema]}.")
+        return hint(**{key: _checked(value[key], sub, f"{label}.{key}") for key, sub in schema})
+    if isinstance(hint, type) and issubclass(hint, Enum):
+        known = {member.value: member for member in hint}
+        if not isinstance(value, str) or value not in known:
+            raise InvalidMessageError(f"{label} is {str(value)[:80]!r}; allowed: {', '.join(known)}.")
+        return known[value]
+    if get_args(hint) == (str, ...):
+        if not isinstance(value, list):
+            raise InvalidMessageError(f"{label} is {str(value)[:80]!r}; it must be a list of texts.")
+        return tuple(_checked(item, str, f"{label}[{i}]") for i, item in enumerate(value))
+    if type(value) is not hint:
+        raise InvalidMessageError(f"{label} is {str(value)[:80]!r}; it must be of type {hint}.")
+    if hint is float and not math.isfinite(value):
+        raise InvalidMessageError(f"{label} is {value}; it must be finite.")
+    return value
+
+
+def _take_array(body: memoryview, at: int, shape: Any, dtype: np.dtype, label: str) -> tuple[np.ndarray, int]:
+    good = isinstance(shape, list) and len(shape) <= 4 and all(type(n) is int and 0 <= n <= MAX_BYTES for n in shape)
+    if not good:
+        raise InvalidMessageError(f"{label} has shape {str(shape)[:80]}; it must be a short list of lengths.")
+    end = at + math.prod(shape) * dtype.itemsize
+    if end > len(body):
+        raise InvalidMessageError(f"{label} with shape {shape} needs {end - at} bytes; {len(body) - at} are there.")
+    raw = body[at:end]
+    if dtype == np.bool_ and len(raw) and np.frombuffer(raw, np.uint8).max() > 1:
+        raise InvalidMessageError(f"{label} holds bytes other than 0 and 1; it must be a mask.")
+    return np.frombuffer(raw, dtype).reshape(shape), end
+
+
+def decode_text(data: bytes, label: str) -> str:
+    """Return a short UTF-8 text, such as an owner's name or a reason.
+
+    Raises:
+        InvalidMessageError: too long, or not UTF-8.
+    """
+    if len(data) > _MAX_TEXT:
+        raise InvalidMessageError(f"{label} has {len(data)} bytes; allowed are {_MAX_TEXT}.")
+    try:
+        return data.decode()
+    except UnicodeDecodeError as err:
+        raise InvalidMessageError(f"{label} is {data[:40]!r}; it must be UTF-8 text.") from err

@@ -1,0 +1,28 @@
+"""Key expressions of the link, all below one Zenoh namespace per robot, so that two robots never hear each other."""
+
+from __future__ import annotations
+
+STATE = "state"
+"""`ArmState`, from the HAL, about 100 Hz."""
+STATUS = "status"
+"""`ServoStatus`, from the HAL, beside each state."""
+FRAME = "frame"
+"""`RgbdFrame`, from the HAL, only while somebody listens; the attachment is a `hal.bus.frames.FrameStamp`."""
+HEARTBEAT = "heartbeat"
+"""The owner's name in UTF-8, from the holder of the lease, 50 Hz."""
+
+HELLO = "srv/hello"
+"""Who is there: answers with a `hal.bus.codec.Hello` once everything runs."""
+CLAIM = "srv/claim"
+RELEASE = "srv/release"
+CHUNK = "srv/chunk"
+"""Takes a `TrajectoryChunk`; the answer says taken, or refused and why."""
+SEND = "srv/send"
+"""Takes an `ArmSetpoint`; answers with the one applied."""
+STOP = "srv/stop"
+"""Takes the reason in UTF-8."""
+REARM = "srv/rearm"
+READ_STATUS = "srv/status"
+"""Answers with the `ServoStatus` of this moment."""
+
+SERVICES = (HELLO, CLAIM, RELEASE, CHUNK, SEND, STOP, REARM, READ_STATUS)

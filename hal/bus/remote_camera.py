@@ -1,0 +1,158 @@
+"""The camera of a HAL process, over the link."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections import deque
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+import zenoh
+
+from hal.bus import keys
+from hal.bus.codec import decode
+from hal.bus.frames import FrameStamp
+from hal.bus.link import Link
+from hal.bus.service import as_bytes
+from hal.bus.session import BusConfig
+from hal.clock import Clock, WallClock
+from hal.errors import HalTimeoutError, InvalidMessageError, NotConnectedError
+from hal.messages import Intrinsics, RgbdFrame
+
+_LOG = logging.getLogger(__name__)
+_LATENCIES_KEPT = 1000
+
+
+class RemoteCamera:
+    """The camera of a HAL process (`hal.camera.Camera`).
+
+    Holds the newest frame only, still packed; it is unpacked in the thread of whoever waits for it.
+
+    Args:
+        config: where the HAL process is.
+        clock: the wall's.
+    """
+
+    def __init__(self, config: BusConfig | None = None, clock: Clock | None = None) -> None:
+        self._config = config or BusConfig()
+        self._clock = clock or WallClock()
+        self._link: Link | None = None
+        self._intrinsics: Intrinsics | None = None
+        self._news = threading.Condition()
+        self._newest: tuple[FrameStamp, zenoh.ZBytes] | None = None
+        self._last_sequence: int | None = None
+        self._latencies_ms: deque[float] = deque(maxlen=_LATENCIES_KEPT)
+        self.lost_frames = 0
+        """How many frames were sent and never arrived, since `connect()`."""
+        self.shared_memory = False
+        """Whether the last frame came through shared memory."""
+
+    def connect(self) -> None:
+        """Open the link and wait for the first frame. Harmless when open.
+
+        Raises:
+            HalTimeoutError: no HAL process answers, or it sends no frame.
+        """
+        if self._link is not None:
+            return
+        self._newest = self._last_sequence = None
+        self.lost_frames = 0
+        self._link = link = Link(self._config, self._clock, "the remote camera")
+        try:
+            link.session.declare_subscriber(keys.FRAME, self._take)
+            # The first frame is answered by a camera that may have to wake up.
+            self._intrinsics = self.wait_for_frame(max(self._config.connect_timeout_s, 1.0)).intrinsics
+        except (HalTimeoutError, InvalidMessageError):
+            self.disconnect()
+            raise
+        self._latencies_ms.clear()
+
+    def disconnect(self) -> None:
+        """Close the link. Harmless when not connected."""
+        link, self._link = self._link, None
+        if link is None:
+            return
+        link.close()
+        self._newest = None
+
+    def __enter__(self) -> Self:
+        self.connect()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.disconnect()
+
+    @property
+    def intrinsics(self) -> Intrinsics:
+        """Of both images of every frame (see `hal.camera.Camera.intrinsics`)."""
+        if self._link is None or self._intrinsics is None:
+            raise NotConnectedError("the remote camera")
+        return self._intrinsics
+
+    @property
+    def frame_latencies_ms(self) -> tuple[float, ...]:
+        """From the HAL's sending to the unpacked frame here, of the last frames that were waited for [ms]."""
+        return tuple(self._latencies_ms)
+
+    def frame_latency_ms(self, percentile: float) -> float:
+        """Return a percentile of `frame_latencies_ms` [ms]; 0 before the first."""
+        return float(np.percentile(self._latencies_ms, percentile)) if self._latencies_ms else 0.0
+
+    def wait_for_frame(self, timeout_s: float) -> RgbdFrame:
+        """Return the next frame exposed after this call began (see `hal.camera.Camera.wait_for_frame`).
+
+        Raises:
+            InvalidMessageError: a frame came that cannot be read.
+        """
+        link = self._link
+        if link is None:
+            raise NotConnectedError("the remote camera")
+        began_s = self._clock.now_s()
+        while True:
+            stamp, payload = self._wait_newer(began_s, timeout_s, link.clock_offset_s)
+            frame = self._unpack(payload)
+            if frame is not None:
+                self._latencies_ms.append(1e3 * (self._clock.now_s() + link.clock_offset_s - stamp.sent_s))
+                return frame
+
+    def _wait_newer(self, began_s: float, timeout_s: float, offset_s: float) -> tuple[FrameStamp, zenoh.ZBytes]:
+        give_up_s = began_s + timeout_s
+        with self._news:
+            while True:
+                newest, self._newest = self._newest, None
+                if newest is not None and newest[0].exposed_s >= began_s + offset_s:
+                    return newest
+                left_s = give_up_s - self._clock.now_s()
+                if left_s <= 0:
+                    raise HalTimeoutError(
+                        f"no new frame from {self._config.endpoint} within {timeout_s} s; "
+                        f"look at the HAL process's log and the camera's cable."
+                    )
+                self._news.wait(left_s)
+
+    def _unpack(self, payload: zenoh.ZBytes) -> RgbdFrame | None:
+        shared = payload.as_shm()
+        data = payload.to_bytes()
+        # Shared memory is taken back from a reader that stood still for too long: then what was copied may be torn.
+        if shared is not None and not shared.is_valid():
+            _LOG.warning("a frame was overwritten while it was read; waiting for the next.")
+            return None
+        self.shared_memory = shared is not None
+        return decode(data, RgbdFrame)
+
+    def _take(self, sample: zenoh.Sample) -> None:
+        try:
+            stamp = FrameStamp.unpack(as_bytes(sample.attachment))
+        except InvalidMessageError as error:
+            _LOG.warning("a frame was dropped: %s", error)
+            return
+        with self._news:
+            if self._last_sequence is not None and stamp.sequence > self._last_sequence + 1:
+                self.lost_frames += stamp.sequence - self._last_sequence - 1
+            self._last_sequence = stamp.sequence
+            self._newest = (stamp, sample.payload)
+            self._news.notify_all()

@@ -1,0 +1,264 @@
+"""The HAL's end of the link: publishes state, status and frames, and takes commands for one servo.
+
+What goes which way, and why:
+
+* State and status: put at 100 Hz, REAL_TIME, DROP, express. The newest replaces the one before.
+* Heartbeat: the same, from the owner. Losing one is harmless, five in a row make the servo brake.
+* Trajectory chunks: acked queries, not puts. A lost chunk would be noticed only by the arm running dry, and a refused
+  one not at all; an answer costs 0.3 ms every 0.1 s.
+* Stop, re-arm, claim, release, send, status: acked queries, each on a thread of its own, so that a stop waits for
+  nobody. Stop and re-arm need no lease: whoever sees the arm may stop it.
+* Frames: put, DATA_LOW, DROP, in shared memory, only while somebody listens.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from importlib.metadata import version
+from threading import Event
+from typing import Protocol
+
+import zenoh
+
+from hal.arm import ServoedArm
+from hal.bus import keys
+from hal.bus.codec import VERSION, Hello, decode, decode_text, encode
+from hal.bus.frames import FrameBuffers, FrameStamp, existing_segments, mapped_segments, unlink_segments
+from hal.bus.service import Answer, GuardedThread, Service, as_bytes, received
+from hal.bus.session import BusConfig, open_session
+from hal.camera import Camera
+from hal.clock import Clock
+from hal.errors import HalError, InvalidMessageError, LeaseError
+from hal.messages import ArmSetpoint, TrajectoryChunk
+
+_LOG = logging.getLogger(__name__)
+_FRAME_TIMEOUT_S = 1.0
+_IDLE_S = 0.2
+_HEARTBEATS_WAITING = 16
+
+
+class OwnedServo(ServoedArm, Protocol):
+    """What the server needs of `hal.servo.Servo`: a servoed arm that tells its callers apart, thread-safe."""
+
+    def release(self, owner: str | None = None) -> None: ...
+
+    def heartbeat(self, owner: str | None = None) -> None: ...
+
+    def stream(self, chunk: TrajectoryChunk, owner: str | None = None) -> None: ...
+
+    def send(self, setpoint: ArmSetpoint, owner: str | None = None) -> ArmSetpoint: ...
+
+    def stop(self, reason: str = ...) -> None: ...
+
+
+class HalServer:
+    """Serves one servo and one camera, both connected by the caller, until `close()`.
+
+    Args:
+        servo: thread-safe; its ticks run elsewhere.
+        camera: used by this server's frame thread alone.
+        clock: the wall's; paces the publishing and stamps what is sent.
+        config: where to listen.
+
+    Raises:
+        HalError: the port is taken.
+    """
+
+    def __init__(self, servo: OwnedServo, camera: Camera, clock: Clock, config: BusConfig) -> None:
+        self._servo = servo
+        self._camera = camera
+        self._clock = clock
+        self._config = config
+        self._closing = Event()
+        self.failed = Event()
+        """Set when a thread of the server died; the process should then stop the arm and end."""
+        self._somebody_watches = Event()
+        before = existing_segments()
+        self._buffers = FrameBuffers(camera.intrinsics, shared=config.shared_memory)
+        try:
+            self._session = open_session(config, listen=True)
+        except HalError:
+            self._buffers.close()
+            raise
+        self._segments = mapped_segments() - before
+        self._threads: list[GuardedThread] = []
+        self._start_publishing()
+        self._services = [
+            Service(self._session, key, answer, self.failed.set, heed_anyone=key == keys.STOP)
+            for key, answer in self._answers()
+        ]
+
+    def __enter__(self) -> HalServer:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @property
+    def uses_shared_memory(self) -> bool:
+        """Whether frames go through shared memory."""
+        return self._buffers.shared
+
+    def close(self) -> None:
+        """Answer nobody any more, end all threads, leave nothing in shared memory. Harmless when done before."""
+        if self._closing.is_set():
+            return
+        self._closing.set()
+        self._somebody_watches.set()
+        for service in self._services:
+            service.close()
+        self._heartbeats.undeclare()
+        for thread in self._threads:
+            thread.join()
+        self._session.close()
+        self._buffers.close()
+        unlink_segments(self._segments)
+
+    def _start_publishing(self) -> None:
+        session = self._session
+        urgent = {
+            "priority": zenoh.Priority.REAL_TIME,
+            "congestion_control": zenoh.CongestionControl.DROP,
+            "express": True,
+        }
+        self._state = session.declare_publisher(keys.STATE, **urgent)
+        self._status = session.declare_publisher(keys.STATUS, **urgent)
+        self._frames = session.declare_publisher(
+            keys.FRAME, priority=zenoh.Priority.DATA_LOW, congestion_control=zenoh.CongestionControl.DROP
+        )
+        self._watchers = self._frames.declare_matching_listener(self._note_watchers)
+        self._heartbeats = session.declare_subscriber(keys.HEARTBEAT, zenoh.handlers.RingChannel(_HEARTBEATS_WAITING))
+        loops: dict[str, Callable[[], None]] = {
+            "bus state": self._publish_state,
+            "bus frames": self._publish_frames,
+            "bus heartbeat": self._take_heartbeats,
+        }
+        for name, loop in loops.items():
+            self._threads.append(GuardedThread(name, loop, self.failed.set))
+            self._threads[-1].start()
+
+    # --- What is published ----------------------------------------------------------------------------------------
+
+    def _publish_state(self) -> None:
+        period_s = 1.0 / self._config.state_rate_hz
+        complaint = _Complaint("the arm's state is not published")
+        due_s = self._clock.now_s()
+        while not self._closing.is_set():
+            try:
+                self._state.put(encode(self._servo.read_state()))
+                self._status.put(encode(self._servo.status()))
+                complaint.over()
+            except HalError as error:
+                complaint.say(error)
+            # Late cycles move the following ones: nothing is sent twice to catch up.
+            due_s = max(due_s + period_s, self._clock.now_s())
+            self._clock.sleep_until(due_s)
+
+    def _note_watchers(self, status: zenoh.MatchingStatus) -> None:
+        if status.matching:
+            self._somebody_watches.set()
+        elif not self._closing.is_set():
+            self._somebody_watches.clear()
+
+    def _publish_frames(self) -> None:
+        complaint = _Complaint("no frames are published")
+        while not self._closing.is_set():
+            if not self._somebody_watches.wait(_IDLE_S):
+                continue
+            try:
+                frame = self._camera.wait_for_frame(_FRAME_TIMEOUT_S)
+                payload = self._buffers.fill(frame)
+            except HalError as error:
+                complaint.say(error)
+                self._closing.wait(_IDLE_S)
+                continue
+            complaint.over()
+            stamp = FrameStamp(sent_s=self._clock.now_s(), exposed_s=frame.stamp_s, sequence=frame.sequence)
+            self._frames.put(payload, attachment=stamp.pack())
+
+    # --- What is taken --------------------------------------------------------------------------------------------
+
+    def _take_heartbeats(self) -> None:
+        complaint = _Complaint("a heartbeat is not taken")
+        for sample in received(self._heartbeats.handler):
+            try:
+                self._servo.heartbeat(decode_text(as_bytes(sample.payload), "the heartbeat") or "nobody")
+                complaint.over()
+            except LeaseError:
+                pass  # a client that has just lost the lease is told so at its next command
+            except HalError as error:
+                complaint.say(error)
+
+    def _answers(self) -> list[tuple[str, Answer]]:
+        servo = self._servo
+
+        def claim(owner: str, _: bytes) -> bytes:
+            servo.claim(owner)
+            return b""
+
+        def release(owner: str, _: bytes) -> bytes:
+            servo.release(owner or "nobody")
+            return b""
+
+        def stream(owner: str, data: bytes) -> bytes:
+            servo.stream(decode(data, TrajectoryChunk), owner=owner)
+            return b""
+
+        def send(owner: str, data: bytes) -> bytes:
+            return encode(servo.send(decode(data, ArmSetpoint), owner=owner))
+
+        def stop(owner: str, data: bytes) -> bytes:
+            servo.stop(_readable(data) or f"stop requested by {owner or 'somebody'}")
+            return b""
+
+        def rearm(_: str, __: bytes) -> bytes:
+            servo.rearm()
+            return b""
+
+        def status(_: str, __: bytes) -> bytes:
+            return encode(servo.status())
+
+        return [
+            (keys.STOP, stop),
+            (keys.CLAIM, claim),
+            (keys.RELEASE, release),
+            (keys.CHUNK, stream),
+            (keys.SEND, send),
+            (keys.REARM, rearm),
+            (keys.READ_STATUS, status),
+            (keys.HELLO, self._hello),  # last: whoever gets an answer here finds all the others too
+        ]
+
+    def _hello(self, _: str, __: bytes) -> bytes:
+        versions = [f"{name}={version(name)}" for name in ("z1-grasp", "eclipse-zenoh")]
+        hello = Hello(robot=self._config.robot, versions=(f"protocol={VERSION}", *versions), now_s=self._clock.now_s())
+        return encode(hello)
+
+
+def _readable(reason: bytes) -> str:
+    # A stop is obeyed whatever it carries.
+    try:
+        return decode_text(reason, "the reason")
+    except InvalidMessageError as error:
+        _LOG.warning("a stop came with an unreadable reason: %s", error)
+        return ""
+
+
+class _Complaint:
+    """Logs a trouble when it begins and when it is over, not at every cycle in between."""
+
+    def __init__(self, what: str) -> None:
+        self._what = what
+        self._text = ""
+
+    def say(self, error: HalError) -> None:
+        # Texts hold stamps and ages: the class tells one trouble from another.
+        if self._text != type(error).__name__:
+            self._text = type(error).__name__
+            _LOG.warning("%s: %s", self._what, error)
+
+    def over(self) -> None:
+        if self._text:
+            self._text = ""
+            _LOG.info("over: %s", self._what)

@@ -1,0 +1,84 @@
+"""The HAL process: one rig, its servo at 500 Hz, and the link to whoever commands it."""
+
+from __future__ import annotations
+
+import logging
+import signal
+from collections.abc import Callable
+from contextlib import ExitStack
+from threading import Event
+
+from hal.bus.server import HalServer
+from hal.bus.session import BusConfig
+from hal.errors import HalError
+from hal.limits import ServoLimits
+from hal.messages import ServoMode
+from hal.rig import Rig
+from hal.servo import Servo
+from hal.servo_thread import ServoThread
+
+_LOG = logging.getLogger(__name__)
+HEARTBEAT_TIMEOUT_S = 0.1
+"""How long the owner may be silent in motion [s]."""
+_BRAKING_S = 2.0
+_LOOK_S = 0.05
+
+
+def stop_on_signals(stop_event: Event) -> None:
+    """Set `stop_event` at SIGTERM, SIGINT and SIGHUP; for the main thread, before `serve`."""
+    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+        signal.signal(number, lambda *_: stop_event.set())
+
+
+def serve(
+    rig: Rig,
+    config: BusConfig,
+    stop_event: Event,
+    *,
+    on_ready: Callable[[], None] | None = None,
+    limits: ServoLimits | None = None,
+    cpu: int | None = None,
+) -> None:
+    """Serve `rig` until `stop_event` is set, then brake, hold and let go of everything.
+
+    Args:
+        rig: not yet connected, living by the wall clock.
+        config: where to listen.
+        stop_event: ends it; `stop_on_signals` ties it to the signals.
+        on_ready: called once everything answers; over the link the sign is the answer at `srv/hello`.
+        limits: of the servo; None = the Z1's.
+        cpu: the core for the servo thread; None = any.
+
+    Raises:
+        HalError: a device does not answer, the port is taken, or the servo or the server failed while running.
+        ValueError: the rig is a lock-step one.
+    """
+    if rig.call_every_tick is not None:
+        raise ValueError("a lock-step rig has no time of its own to be served by; make it with the wall clock.")
+    servo = Servo(rig.arm, rig.clock, limits, heartbeat_timeout_s=HEARTBEAT_TIMEOUT_S)
+    ticking = ServoThread(servo, rig.clock, cpu=cpu)
+    with ExitStack() as undo:  # in reverse order, whatever of it was reached
+        servo.connect()
+        undo.callback(servo.disconnect)
+        rig.camera.connect()
+        undo.callback(rig.camera.disconnect)
+        ticking.start()
+        undo.callback(ticking.stop)
+        server = undo.enter_context(HalServer(servo, rig.camera, rig.clock, config))
+        undo.callback(_come_to_rest, servo, ticking)
+        _LOG.info("serving robot %s at %s", config.robot, config.endpoint)
+        if on_ready is not None:
+            on_ready()
+        while not stop_event.wait(_LOOK_S) and ticking.alive:
+            if server.failed.is_set():
+                raise HalError("a thread of the link's server died; its traceback is above. The arm is being stopped.")
+
+
+def _come_to_rest(servo: Servo, ticking: ServoThread) -> None:
+    """Brake while the servo still ticks; clients see it happen, and can command nothing any more."""
+    servo.stop("the HAL process is ending")
+    pause = Event()
+    waited_s = 0.0
+    while ticking.alive and servo.status().mode is not ServoMode.STOPPED and waited_s < _BRAKING_S:
+        pause.wait(_LOOK_S)
+        waited_s += _LOOK_S

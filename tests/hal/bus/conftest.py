@@ -1,0 +1,91 @@
+"""A HAL on a free loopback port, in this process or in one of its own."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Iterator
+from dataclasses import dataclass
+from threading import Event
+
+import numpy as np
+import pytest
+
+from hal.backends.mock_arm import MockArm
+from hal.backends.replay_camera import ReplayCamera
+from hal.bus.client import RemoteArm, RemoteCamera
+from hal.bus.server import HalServer
+from hal.bus.session import BusConfig
+from hal.clock import WallClock
+from hal.messages import ServoMode, TrajectoryChunk
+from hal.servo import Servo
+from hal.servo_thread import ServoThread
+from hal.z1 import N_JOINTS, Q_HOME
+
+
+@dataclass
+class Hal:
+    """Both ends' handles on one running HAL."""
+
+    config: BusConfig
+    arm: MockArm
+    camera: ReplayCamera
+    servo: Servo
+    server: HalServer
+
+
+def free_config(**options) -> BusConfig:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    return BusConfig(port=port, **options)
+
+
+def slow_motion(trajectory_id: int = 1, duration_s: float = 3.0) -> TrajectoryChunk:
+    """Joint 1 turns 0.6 rad from home, smoothly."""
+    s = np.linspace(0.0, 1.0, int(50 * duration_s) + 1)
+    q = np.tile(np.append(Q_HOME, 0.0), (len(s), 1))
+    dq = np.zeros((len(s), N_JOINTS))
+    q[:, 0] += 0.6 * (3 * s**2 - 2 * s**3)
+    dq[:, 0] = 0.6 * (6 * s - 6 * s**2) / duration_s
+    return TrajectoryChunk(trajectory_id=trajectory_id, t_s=s * duration_s, q=q, dq=dq, final=True)
+
+
+def wait_until(condition, timeout_s: float = 10.0):
+    """Return the first true value of `condition()`; fail when there is none for long (a bound for hangs only)."""
+    clock, pause = WallClock(), Event()
+    give_up_s = clock.now_s() + timeout_s
+    while not (value := condition()):
+        assert clock.now_s() < give_up_s, "waited in vain"
+        pause.wait(0.005)
+    return value
+
+
+def moving(servo) -> bool:
+    status = servo.status()
+    return status.mode is ServoMode.TRACKING and status.trajectory_time_s > 0.3
+
+
+@pytest.fixture
+def hal() -> Iterator[Hal]:
+    clock = WallClock()
+    config = free_config()
+    arm, camera = MockArm(clock), ReplayCamera(clock=clock)
+    servo = Servo(arm, clock, heartbeat_timeout_s=0.1)
+    servo.connect()
+    camera.connect()
+    with ServoThread(servo, clock), HalServer(servo, camera, clock, config) as server:
+        yield Hal(config, arm, camera, servo, server)
+    servo.disconnect()
+    camera.disconnect()
+
+
+@pytest.fixture
+def remote_arm(hal: Hal) -> Iterator[RemoteArm]:
+    with RemoteArm(hal.config, owner="tester") as arm:
+        yield arm
+
+
+@pytest.fixture
+def remote_camera(hal: Hal) -> Iterator[RemoteCamera]:
+    with RemoteCamera(hal.config) as camera:
+        yield camera

@@ -1,0 +1,373 @@
+"""Both ends of the link in one process, over real Zenoh sessions."""
+
+from __future__ import annotations
+
+import logging
+from threading import Event, Thread
+
+import numpy as np
+import pytest
+import zenoh
+from conftest import moving, slow_motion, wait_until
+
+from hal.arm import ServoedArm
+from hal.bus import keys
+from hal.bus.client import RemoteArm, RemoteCamera
+from hal.bus.codec import encode
+from hal.bus.frames import FrameBuffers, FrameStamp
+from hal.bus.session import BusConfig, open_session
+from hal.bus.wire_errors import decode_error
+from hal.camera import Camera
+from hal.clock import WallClock
+from hal.errors import (
+    CommandRefusedError,
+    HalTimeoutError,
+    InvalidMessageError,
+    LeaseError,
+    NotConnectedError,
+    StoppedError,
+)
+from hal.messages import ArmSetpoint, ServoMode, TrajectoryChunk
+from hal.z1 import Q_HOME
+
+HOME = np.append(Q_HOME, 0.0)
+
+
+# --- The arm ------------------------------------------------------------------------------------------------------
+
+
+def test_the_remote_devices_satisfy_the_contracts(remote_arm, remote_camera):
+    assert isinstance(remote_arm, ServoedArm)
+    assert isinstance(remote_camera, Camera)
+
+
+def test_before_connect_every_call_says_so_and_disconnect_is_harmless():
+    arm = RemoteArm()
+    setpoint = ArmSetpoint(q=HOME, dq=np.zeros(7))
+    calls = [arm.read_state, arm.stop, arm.claim, arm.release, arm.status, arm.rearm]
+    for call in [*calls, lambda: arm.send(setpoint), lambda: arm.stream(slow_motion())]:
+        with pytest.raises(NotConnectedError):
+            call()
+    arm.disconnect()
+
+
+def test_a_trajectory_is_played_to_its_end(hal, remote_arm):
+    remote_arm.claim()
+    chunk = slow_motion(duration_s=0.8)
+    remote_arm.stream(chunk)
+    status = wait_until(lambda: (s := remote_arm.status()).finished and s)
+    assert status.trajectory_id == chunk.trajectory_id
+    assert status.mode is ServoMode.HOLDING
+    np.testing.assert_allclose(status.q_command, chunk.q[-1], atol=1e-6)
+    wait_until(lambda: abs(remote_arm.read_state().q[0] - chunk.q[-1, 0]) < 1e-3)
+
+
+def test_a_status_asked_for_after_a_chunk_tells_of_that_chunk(remote_arm):
+    remote_arm.claim()
+    for trajectory_id in (1, 2):
+        chunk = TrajectoryChunk(
+            trajectory_id=trajectory_id, t_s=[0.0, 0.1], q=[HOME, HOME], dq=np.zeros((2, 7)), final=True
+        )
+        remote_arm.stream(chunk)
+        wait_until(lambda i=trajectory_id: remote_arm.status().trajectory_id == i and remote_arm.status().finished)
+
+
+def test_a_setpoint_comes_back_as_it_was_applied(remote_arm):
+    remote_arm.claim()
+    far = HOME + np.array([1.0, 0, 0, 0, 0, 0, 0])
+    applied = remote_arm.send(ArmSetpoint(q=far, dq=np.zeros(7)))
+    assert 0 < applied.q[0] < 0.1
+
+
+def test_the_lease_names_its_holder_to_the_second_client_and_can_be_handed_over(hal, remote_arm):
+    with RemoteArm(hal.config, owner="rival") as rival:
+        remote_arm.claim()
+        with pytest.raises(LeaseError, match="tester-"):
+            rival.claim()
+        with pytest.raises(LeaseError, match="tester-"):
+            rival.stream(slow_motion())
+        rival.release()
+        assert remote_arm.status().owner.startswith("tester-")
+        remote_arm.release()
+        rival.claim()
+        assert remote_arm.status().owner.startswith("rival-")
+
+
+def test_two_clients_of_one_name_are_two_owners(hal, remote_arm):
+    remote_arm.claim("twin")
+    with RemoteArm(hal.config, owner="tester") as other, pytest.raises(LeaseError):
+        other.claim("twin")
+
+
+def test_the_heartbeat_keeps_a_motion_alive_well_beyond_the_servos_patience(remote_arm):
+    remote_arm.claim()
+    remote_arm.stream(slow_motion(duration_s=1.0))
+    wait_until(lambda: moving(remote_arm))
+    assert wait_until(lambda: (s := remote_arm.status()).mode is not ServoMode.TRACKING and s).finished
+
+
+def test_disconnecting_in_motion_brakes_and_frees_the_lease(hal, remote_arm):
+    remote_arm.claim()
+    remote_arm.stream(slow_motion())
+    wait_until(lambda: moving(hal.servo))
+    remote_arm.disconnect()
+    wait_until(lambda: hal.servo.status().mode is ServoMode.HOLDING)
+    status = hal.servo.status()
+    assert not status.finished
+    assert status.owner == ""
+
+
+def test_refusals_cross_the_link_as_their_own_classes(remote_arm):
+    with pytest.raises(LeaseError):
+        remote_arm.stream(slow_motion())
+    remote_arm.claim()
+    far = TrajectoryChunk(trajectory_id=1, t_s=[0.0, 1.0], q=np.full((2, 7), -0.5), dq=np.zeros((2, 7)))
+    with pytest.raises(CommandRefusedError, match="starts"):
+        remote_arm.stream(far)
+    remote_arm.stop("enough")
+    with pytest.raises(StoppedError, match="enough"):
+        remote_arm.stream(slow_motion())
+
+
+def test_a_stop_from_a_second_client_holds_until_rearmed(hal, remote_arm):
+    remote_arm.claim()
+    remote_arm.stream(slow_motion())
+    wait_until(lambda: moving(hal.servo))
+    with RemoteArm(hal.config, owner="bystander") as bystander:
+        bystander.stop("a hand came near")
+        stopped = wait_until(lambda: (s := hal.servo.status()).mode is ServoMode.STOPPED and s)
+        assert stopped.reason == "a hand came near"
+        for attempt in (
+            lambda: remote_arm.stream(slow_motion(2)),
+            lambda: remote_arm.send(ArmSetpoint(q=HOME, dq=HOME)),
+        ):
+            with pytest.raises(StoppedError):
+                attempt()
+        np.testing.assert_array_equal(hal.servo.status().q_command, stopped.q_command)
+        bystander.rearm()
+    remote_arm.claim()
+    q = hal.servo.status().q_command
+    remote_arm.stream(TrajectoryChunk(trajectory_id=2, t_s=[0.0, 0.1], q=[q, q], dq=np.zeros((2, 7)), final=True))
+    wait_until(lambda: remote_arm.status().finished)
+
+
+def test_a_stop_gets_through_while_another_query_is_stuck(hal, remote_arm, monkeypatch):
+    stuck, let_go = Event(), Event()
+
+    def slow_rearm() -> None:
+        stuck.set()
+        let_go.wait()
+
+    monkeypatch.setattr(hal.servo, "rearm", slow_rearm)
+    with RemoteArm(hal.config) as other:
+        errors: list[Exception] = []
+
+        def ask() -> None:
+            try:
+                other.rearm()
+            except HalTimeoutError as error:
+                errors.append(error)
+
+        asking = Thread(target=ask)
+        asking.start()
+        assert stuck.wait(10)
+        remote_arm.stop("now")
+        assert hal.servo.status().reason == "now"
+        assert not let_go.is_set()
+        asking.join()
+        assert "no answer" in str(errors[0])
+        let_go.set()
+
+
+def test_an_arm_that_stops_measuring_makes_the_remote_state_too_old(hal, remote_arm):
+    remote_arm.read_state()
+    hal.arm.freeze()
+
+    def too_old() -> bool:
+        try:
+            remote_arm.read_state()
+        except HalTimeoutError as error:
+            return "is 0." in str(error)
+        return False
+
+    wait_until(too_old)
+
+
+def test_a_hal_that_goes_away_gives_typed_errors(hal, remote_arm):
+    remote_arm.claim()
+    hal.server.close()
+    with pytest.raises(HalTimeoutError, match="no HAL process answers"):
+        remote_arm.stream(slow_motion())
+    with pytest.raises(HalTimeoutError):
+        remote_arm.stop()
+    remote_arm.disconnect()
+
+
+# --- The camera ---------------------------------------------------------------------------------------------------
+
+
+def test_a_frame_is_one_exposed_after_the_call_and_none_is_lost_on_the_way(remote_camera):
+    clock = WallClock()
+    sequences = []
+    for _ in range(5):
+        began_s = clock.now_s()
+        frame = remote_camera.wait_for_frame(2.0)
+        assert frame.stamp_s >= began_s
+        assert frame.intrinsics == remote_camera.intrinsics
+        sequences.append(frame.sequence)
+    assert sequences == sorted(set(sequences))
+    assert remote_camera.lost_frames == 0
+    assert len(remote_camera.frame_latencies_ms) == 5
+    assert 0 < remote_camera.frame_latency_ms(50) <= remote_camera.frame_latency_ms(99)
+
+
+def test_frames_arrive_pixel_by_pixel_through_shared_memory_and_without(hal):
+    originals = {}
+    take = hal.camera.wait_for_frame
+
+    def remember(timeout_s):
+        frame = take(timeout_s)
+        originals[frame.sequence] = frame
+        return frame
+
+    hal.camera.wait_for_frame = remember
+    for shared in (True, False):
+        config = BusConfig(port=hal.config.port, shared_memory=shared)
+        with RemoteCamera(config) as camera:
+            frame = camera.wait_for_frame(2.0)
+            assert camera.shared_memory is (shared and hal.server.uses_shared_memory)
+            np.testing.assert_array_equal(frame.colour, originals[frame.sequence].colour)
+            np.testing.assert_array_equal(frame.depth_m, originals[frame.sequence].depth_m)
+
+
+def test_the_camera_is_only_read_while_somebody_listens(hal):
+    reads = []
+    take = hal.camera.wait_for_frame
+    hal.camera.wait_for_frame = lambda timeout_s: (reads.append(1), take(timeout_s))[1]
+    with RemoteArm(hal.config):
+        Event().wait(0.3)
+        assert reads == []
+    with RemoteCamera(hal.config) as camera:
+        camera.wait_for_frame(2.0)
+    assert reads
+
+
+def test_a_camera_that_falls_silent_is_a_timeout(hal, remote_camera):
+    def silence(timeout_s):
+        Event().wait(0.05)
+        raise HalTimeoutError("the cable is out")
+
+    hal.camera.wait_for_frame = silence
+    Event().wait(0.1)
+    with pytest.raises(HalTimeoutError, match="no new frame"):
+        remote_camera.wait_for_frame(0.3)
+
+
+def test_a_gap_in_the_sequence_is_counted(hal, remote_camera):
+    take = hal.camera.wait_for_frame
+    hal.camera.wait_for_frame = lambda timeout_s: (take(timeout_s), take(timeout_s), take(timeout_s))[2]
+    wait_until(lambda: remote_camera.lost_frames >= 2)
+
+
+def test_without_room_in_shared_memory_frames_go_as_bytes_with_one_warning(hal, monkeypatch, caplog):
+    class Full:
+        f_bavail, f_frsize = 100, 4096
+
+    monkeypatch.setattr("hal.bus.frames.os.statvfs", lambda _: Full)
+    with caplog.at_level(logging.WARNING):
+        buffers = FrameBuffers(hal.camera.intrinsics, shared=True)
+    assert not buffers.shared
+    assert len(caplog.records) == 1
+    frame = hal.camera.wait_for_frame(1.0)
+    assert buffers.fill(frame) == encode(frame)
+
+
+# --- What does not belong -------------------------------------------------------------------------------------------
+
+GARBAGE = [b"", b"\x00" * 8, b"not a message", encode(ArmSetpoint(q=HOME, dq=HOME))[:-3], b"\xff" * 5000]
+
+
+@pytest.fixture
+def intruder(hal):
+    with open_session(hal.config, listen=False) as session:
+        yield session
+
+
+@pytest.mark.parametrize("payload", GARBAGE)
+@pytest.mark.parametrize("key", [keys.CHUNK, keys.SEND])
+def test_a_malformed_command_gets_one_clear_error_and_moves_nothing(hal, remote_arm, intruder, key, payload):
+    remote_arm.claim()
+    q = hal.servo.status().q_command
+    (reply,) = list(intruder.get(key, payload=payload, attachment=remote_arm.status().owner.encode(), timeout=5.0))
+    error = decode_error(reply.err.payload.to_bytes())
+    assert type(error) is InvalidMessageError
+    status = hal.servo.status()
+    assert status.mode is ServoMode.HOLDING
+    np.testing.assert_array_equal(status.q_command, q)
+    assert not hal.server.failed.is_set()
+
+
+def test_an_unreadable_owner_is_refused_everywhere_but_at_the_stop(hal, intruder):
+    for key in keys.SERVICES:
+        (reply,) = list(intruder.get(key, payload=b"\xff", attachment=b"\xff\xfe", timeout=5.0))
+        if key == keys.STOP:
+            assert reply.ok is not None
+        else:
+            assert type(decode_error(reply.err.payload.to_bytes())) is InvalidMessageError
+    assert hal.servo.status().mode in (ServoMode.STOPPED, ServoMode.BRAKING)
+    assert "stop requested" in hal.servo.status().reason
+
+
+@pytest.mark.parametrize("beat", [b"", b"\xff\xfe", b"somebody else", b"x" * 100_000])
+def test_a_strangers_heartbeat_keeps_no_motion_alive_and_breaks_nothing(hal, intruder, beat):
+    hal.servo.claim("a silent owner")
+    hal.servo.stream(slow_motion())
+    publisher = intruder.declare_publisher(keys.HEARTBEAT, express=True)
+
+    def stopped() -> bool:
+        publisher.put(beat)
+        return hal.servo.status().mode is ServoMode.HOLDING
+
+    wait_until(stopped)
+    assert "heartbeat" in hal.servo.status().reason
+    assert not hal.server.failed.is_set()
+
+
+def test_malformed_states_and_frames_are_refused_by_the_client(hal):
+    hal.server.close()
+    with open_session(hal.config, listen=True) as impostor:
+        arm, camera = RemoteArm(hal.config), RemoteCamera(hal.config)
+        hello = encode(_hello(hal.config))
+
+        def greet(query: zenoh.Query) -> None:
+            query.reply(keys.HELLO, hello)
+
+        impostor.declare_queryable(keys.HELLO, greet)
+        end = Event()
+
+        def publish() -> None:
+            stamp = FrameStamp(sent_s=1.0, exposed_s=1e9, sequence=1)
+            while not end.wait(0.02):
+                impostor.put(keys.STATE, b"no state")
+                impostor.put(keys.FRAME, b"no frame", attachment=b"no stamp")
+                impostor.put(keys.FRAME, b"no frame", attachment=stamp.pack())
+
+        thread = Thread(target=publish)
+        thread.start()
+        try:
+            arm.connect()
+            with pytest.raises(InvalidMessageError, match="no state"):
+                arm.read_state()
+            with pytest.raises(InvalidMessageError, match="no frame"):
+                camera.connect()
+        finally:
+            end.set()
+            thread.join()
+            arm.disconnect()
+            camera.disconnect()
+
+
+def _hello(config: BusConfig):
+    from hal.bus.codec import Hello
+
+    return Hello(robot=config.robot, versions=(), now_s=WallClock().now_s())

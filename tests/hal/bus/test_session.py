@@ -1,0 +1,76 @@
+"""Opening the link: what is wrong is said before anything moves."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+from conftest import free_config
+
+from hal.bus.client import RemoteArm, RemoteCamera
+from hal.bus.session import BusConfig, open_session
+from hal.errors import HalError, HalTimeoutError
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"robot": ""},
+        {"robot": "a/b"},
+        {"robot": "*"},
+        {"port": 0},
+        {"port": 70000},
+        {"request_timeout_s": 0.0},
+        {"connect_timeout_s": float("nan")},
+    ],
+)
+def test_a_config_that_cannot_work_is_refused(options):
+    with pytest.raises(ValueError, match=next(iter(options))):
+        BusConfig(**options)
+
+
+@pytest.mark.parametrize(
+    ("host", "loopback"), [("127.0.0.1", True), ("::1", True), ("localhost", True), ("0.0.0.0", False), ("z1", False)]
+)
+def test_only_loopback_counts_as_private(host, loopback):
+    assert BusConfig(host=host).is_loopback is loopback
+
+
+def test_a_port_in_use_is_named_with_what_to_do():
+    config = free_config()
+    with (
+        open_session(config, listen=True),
+        pytest.raises(HalError, match=rf"port {config.port} on 127.0.0.1 is taken.*`--port`"),
+    ):
+        open_session(config, listen=True)
+
+
+@pytest.mark.parametrize("device", [RemoteArm, RemoteCamera])
+def test_a_client_with_nobody_there_is_told_how_to_start_one(device):
+    config = free_config(connect_timeout_s=0.3)
+    with pytest.raises(HalTimeoutError, match=rf"{config.port}.*`./z1 hal --hal sim`"):
+        device(config).connect()
+
+
+def test_a_client_of_another_robot_finds_nobody(hal):
+    config = BusConfig(port=hal.config.port, robot="other", connect_timeout_s=0.3)
+    with pytest.raises(HalTimeoutError, match="'other'"):
+        RemoteArm(config).connect()
+
+
+def _own_sockets(table: str) -> list[list[str]]:
+    """Return the rows of /proc/net/`table` that belong to this process."""
+    own = {os.readlink(fd) for fd in Path("/proc/self/fd").iterdir() if os.path.lexists(fd)}
+    rows = [row.split() for row in Path(f"/proc/self/net/{table}").read_text().splitlines()[1:]]
+    return [row for row in rows if f"socket:[{row[9]}]" in own]
+
+
+@pytest.mark.skipif(not Path("/proc/self/net/tcp").exists(), reason="reads Linux's socket tables")
+def test_the_session_listens_on_its_loopback_endpoint_and_scouts_nowhere():
+    config = free_config()
+    before = [row[1] for row in _own_sockets("udp") + _own_sockets("udp6")]
+    with open_session(config, listen=True):
+        listening = [row[1] for row in _own_sockets("tcp") + _own_sockets("tcp6") if row[3] == "0A"]
+        assert listening == [f"0100007F:{config.port:04X}"]
+        assert [row[1] for row in _own_sockets("udp") + _own_sockets("udp6")] == before
