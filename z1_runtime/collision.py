@@ -199,7 +199,7 @@ class CollisionChecker:
         if one >= 0:
             return Problem(reason="self", detail=f"{CAPSULES[one].link} would hit {CAPSULES[other].link}.")
         vertices = self._shape.fixed[:_SELF_VERTICES]
-        c = _first_capsule_hit(pivots, vertices, ends[:, _OBSTACLES], _RADII[_OBSTACLES])
+        c = _first_capsule_hit(pivots, vertices, np.ascontiguousarray(ends[:, _OBSTACLES]), _RADII[_OBSTACLES])
         if c >= 0:
             link = [capsule.link for capsule in CAPSULES if capsule.link in GRIPPER_OBSTACLES][c]
             return Problem(reason="self", detail=f"gripper or camera would hit {link}.")
@@ -236,12 +236,13 @@ class CollisionChecker:
 
 def warm_up() -> None:
     """Load what is compiled and what is read from meshes, so that the first plan is as fast as the next."""
-    pose, point = np.eye(4)[None], np.zeros((1, 3))
+    pose, point, read_only = np.eye(4)[None], np.zeros((1, 3)), gripper_shape().fixed[:1]
     index = SceneIndex(point)
-    index.first_hits(pose, gripper_shape().fixed[:1], 0.0)
     index.near(point, 0.0)
+    for vertices in (point, read_only):  # compiled apart
+        index.first_hits(pose, vertices, 0.0)
     ends = np.zeros((1, 1, 2, 3))
-    _first_capsule_hit(pose, point, ends, np.zeros(1))
+    _first_capsule_hit(pose, read_only, ends, np.zeros(1))
     _first_capsule_pair(ends, np.zeros(1), np.zeros((1, 2), dtype=np.int64))
 
 

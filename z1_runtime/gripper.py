@@ -147,8 +147,8 @@ class BeakGripper:
         deep = "" if front_m is None else f" and reaches {front_m * 1e3:.0f} mm from the contacts towards the palm"
         return (
             f"the object is {width_m * 1e3:.0f} mm wide{deep}; with a friction coefficient of {self.config.friction} "
-            f"the beak holds a round one of up to {self.max_width_m * 1e3:.0f} mm, and one that reaches deep into the hand "
-            f"up to {self.config.max_setback_m * 1e3:.0f} mm nearer its front than asked."
+            f"the beak holds a round one of up to {self.max_width_m * 1e3:.0f} mm, and one that reaches deep into "
+            f"the hand up to {self.config.max_setback_m * 1e3:.0f} mm nearer its front than asked."
         )
 
     def fit_batch(

@@ -271,6 +271,9 @@ class _Fitted:
             self._fit_chunk(rank // _CHUNK)
         batch, problems = self._chunks[rank // _CHUNK]
         n = rank % _CHUNK
+        under = [problem for problem in problems[n] if problem is not None and problem.reason == "table"]
+        if len(under) == len(problems[n]):
+            return under[0]
         if not batch.fits[n]:
             return Problem(
                 reason="width", detail=self._gripper.refusal(float(self.widths_m[rank]), float(self._fronts_m[rank]))

@@ -1,0 +1,178 @@
+"""Plans on analytic scenes: what is reachable gets a motion, what is not is refused for the right reason."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from tabletop_scenes import (
+    HEIGHT_M,
+    Q_START,
+    camera_pose,
+    cylinder,
+    frontal,
+    in_camera,
+    make_observation,
+    wall,
+)
+
+from hal import z1
+from models.types import GraspSet
+from z1_runtime.collision import CollisionChecker
+from z1_runtime.kinematics import Kinematics
+from z1_runtime.planner import GraspPlanner, NoPlanError, PlannerConfig
+from z1_runtime.se3 import pose_error
+from z1_runtime.types import Observation
+
+PLACES = [(x, y) for x in (0.40, 0.48, 0.56) for y in (-0.15, 0.0, 0.15)]
+
+
+@pytest.fixture(scope="module")
+def kinematics() -> Kinematics:
+    return Kinematics()
+
+
+@pytest.fixture(scope="module")
+def planner(kinematics) -> GraspPlanner:
+    return GraspPlanner(kinematics)
+
+
+def scene(kinematics: Kinematics, x: float, y: float, *obstacles: np.ndarray) -> Observation:
+    T_base_camera = camera_pose(kinematics)
+    return make_observation(T_base_camera, cylinder(x, y, T_base_camera[:3, 3]), *obstacles)
+
+
+def candidates(observation: Observation, x: float, y: float, width_m: float = 0.06) -> GraspSet:
+    """Return frontal grasps of a cylinder at (x, y), all right by construction."""
+    bearing = np.arctan2(y, x)
+    grasps = [
+        frontal(x, y, z, pitch, bearing + turn)
+        for z in (0.09, 0.075, 0.11)
+        for pitch in np.deg2rad([10, 20, 30, 40])
+        for turn in np.deg2rad([0, -15, 15])
+    ]
+    return in_camera(observation.T_base_camera, grasps, width_m)
+
+
+def refusals(planner: GraspPlanner, grasps: GraspSet, observation: Observation) -> list[tuple[str, str]]:
+    with pytest.raises(NoPlanError) as caught:
+        planner.plan(grasps, observation, Q_START)
+    return [(rejection.reason, rejection.detail) for rejection in caught.value.rejections]
+
+
+@pytest.mark.parametrize(("x", "y"), PLACES)
+def test_a_standing_cylinder_is_planned_wherever_it_may_stand(planner, kinematics, x, y):
+    observation = scene(kinematics, x, y)
+    plan = planner.plan(candidates(observation, x, y), observation, Q_START)
+    legs = (plan.transfer, plan.approach, plan.close, plan.lift)
+    assert plan.transfer.q[0] == pytest.approx(Q_START)
+    for before, after in zip(legs, legs[1:], strict=False):
+        assert after.q[0] == pytest.approx(before.q[-1], abs=1e-9)
+    for leg in legs:
+        assert (leg.q >= z1.Q_MIN - 1e-9).all()
+        assert (leg.q <= z1.Q_MAX + 1e-9).all()
+        assert (np.abs(leg.dq) <= z1.DQ_MAX).all()
+    at_grasp = kinematics.pivot(plan.approach.q[-1, : z1.N_ARM])
+    assert max(pose_error(at_grasp, plan.T_base_pivot)) < 1e-4
+    lifted = kinematics.pivot(plan.lift.q[-1, : z1.N_ARM])
+    assert lifted[:3, 3] - at_grasp[:3, 3] == pytest.approx([0.0, 0.0, planner.config.lift_m], abs=1e-4)
+    back = kinematics.pivot(plan.approach.q[0, : z1.N_ARM])[:3, 3] - at_grasp[:3, 3]
+    assert back / np.linalg.norm(back) == pytest.approx(-plan.T_base_grasp[:3, 2], abs=1e-3)
+    assert plan.jaw_open < plan.jaw_contact < plan.close.q[-1, -1] <= 0.0
+    assert plan.approach.q[-1, -1] == pytest.approx(plan.jaw_open)
+
+
+def test_the_plan_keeps_its_distances_all_the_way(planner, kinematics):
+    observation = scene(kinematics, 0.48, 0.15, wall(0.60, 0.0))
+    plan = planner.plan(candidates(observation, 0.48, 0.15), observation, Q_START)
+    checker = CollisionChecker(kinematics, observation, Q_START)
+    assert checker.check_trajectory(plan.transfer, threshold_m=0.004, object_threshold_m=0.004) is None
+    assert checker.check_trajectory(plan.approach, threshold_m=0.002, object_threshold_m=0.001) is None
+    assert checker.check_trajectory(plan.lift, threshold_m=0.002) is None
+    for leg in (plan.transfer, plan.approach, plan.lift):
+        poses = np.array([kinematics.pivot(q[: z1.N_ARM]) for q in leg.q[::10]])
+        assert checker.check_grippers(poses, leg.q[::10, -1]).height_m.min() >= checker.config.table_margin_m
+
+
+def test_a_grasp_from_below_is_refused_for_the_table(planner, kinematics):
+    observation = scene(kinematics, 0.48, 0.0)
+    below = in_camera(observation.T_base_camera, [frontal(0.48, 0.0, 0.06, np.deg2rad(-60))])
+    [(reason, detail)] = refusals(planner, below, observation)
+    assert reason == "table"
+    assert "above the table" in detail
+
+
+def test_a_grasp_from_behind_is_refused_for_its_joints(planner, kinematics):
+    observation = scene(kinematics, 0.56, 0.0)
+    behind = in_camera(observation.T_base_camera, [frontal(0.56, 0.0, 0.09, np.deg2rad(20), np.pi)])
+    [(reason, _)] = refusals(planner, behind, observation)
+    assert reason == "ik"
+
+
+def test_an_object_too_wide_is_refused_with_figures(planner, kinematics):
+    observation = scene(kinematics, 0.48, 0.0)
+    [(reason, detail), *_] = refusals(planner, candidates(observation, 0.48, 0.0, width_m=0.110), observation)
+    assert reason == "width"
+    assert "110 mm wide" in detail
+
+
+def test_a_neighbour_where_the_jaws_would_go_is_refused_as_scene(planner, kinematics):
+    T_base_camera = camera_pose(kinematics)
+    neighbours = [cylinder(0.48, side * 0.075, T_base_camera[:3, 3]) for side in (-1.0, 1.0)]
+    observation = scene(kinematics, 0.48, 0.0, *neighbours)
+    reasons = refusals(planner, in_camera(T_base_camera, [frontal(0.48, 0.0, 0.09, np.deg2rad(20))]), observation)
+    assert [reason for reason, _ in reasons] == ["scene"]
+
+
+def test_a_grasp_that_would_push_the_object_is_refused_as_object(planner, kinematics):
+    observation = scene(kinematics, 0.48, 0.0)
+    beside = frontal(0.48, 0.0, 0.09, np.deg2rad(20))
+    beside[1, 3] += 0.030
+    [(reason, _)] = refusals(planner, in_camera(observation.T_base_camera, [beside]), observation)
+    assert reason == "object"
+
+
+def test_a_wall_before_the_object_leaves_no_way(planner, kinematics):
+    observation = scene(kinematics, 0.56, 0.0, wall(0.42, 0.0, height=0.45))
+    reasons = refusals(planner, candidates(observation, 0.56, 0.0), observation)
+    assert {"scene"} <= {reason for reason, _ in reasons} <= {"scene", "path", "ik", "self", "width"}
+
+
+def test_the_first_that_passes_is_taken_and_the_refused_are_reported(planner, kinematics):
+    observation = scene(kinematics, 0.48, 0.0)
+    good = candidates(observation, 0.48, 0.0)
+    bad = in_camera(
+        observation.T_base_camera,
+        [frontal(0.48, 0.0, 0.06, np.deg2rad(-60)), frontal(0.9, 0.0, 0.09, np.deg2rad(20))],
+    )
+    both = GraspSet(
+        T_camera_grasps=np.concatenate([bad.T_camera_grasps, good.T_camera_grasps]),
+        scores=np.ones(len(bad) + len(good)),
+        widths_m=np.concatenate([bad.widths_m, good.widths_m]),
+    )
+    alone, plan = planner.plan(good, observation, Q_START), planner.plan(both, observation, Q_START)
+    assert plan.rank == alone.rank + 2
+    assert [rejection.rank for rejection in plan.rejections] == list(range(plan.rank))
+    assert [rejection.reason for rejection in plan.rejections[:2]] == ["table", "ik"]
+    assert plan.approach.q == pytest.approx(alone.approach.q)
+
+
+def test_unknown_widths_are_measured_in_the_cloud(planner, kinematics):
+    observation = scene(kinematics, 0.48, 0.0)
+    unsaid = candidates(observation, 0.48, 0.0, width_m=np.nan)
+    plan = planner.plan(unsaid, observation, Q_START)
+    assert plan.width_m == pytest.approx(0.060, abs=0.004)
+
+
+def test_no_candidates_and_a_spent_budget_are_said_plainly(kinematics, planner):
+    observation = scene(kinematics, 0.48, 0.0)
+    nothing = GraspSet(T_camera_grasps=np.empty((0, 4, 4)), scores=np.empty(0), widths_m=np.empty(0))
+    with pytest.raises(NoPlanError, match="none of 0 candidates"):
+        planner.plan(nothing, observation, Q_START)
+    far = in_camera(observation.T_base_camera, [frontal(0.9, 0.0, HEIGHT_M / 2, 0.4)] * 5)
+    with pytest.raises(NoPlanError, match=r"2 ik, 3 not tried"):
+        GraspPlanner(kinematics, PlannerConfig(max_tried=2)).plan(far, observation, Q_START)
+
+
+def test_a_configuration_that_makes_no_sense_is_refused():
+    with pytest.raises(ValueError, match="short_standoff_m <= standoff_m"):
+        PlannerConfig(standoff_m=0.05, short_standoff_m=0.06)
