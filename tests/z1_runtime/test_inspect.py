@@ -9,7 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import rerun as rr
+import trimesh
 from rerun.chunk import RrdReader
+from scipy.spatial import KDTree
 
 from hal import z1
 from hal.messages import ArmState, Intrinsics, RgbdFrame, ServoMode, ServoStatus
@@ -265,3 +268,26 @@ def test_gripper_strip_ends_at_the_fingertips_on_either_side_of_the_grasp() -> N
     strip = gripper_strips(np.eye(4)[None], np.array([0.08]))[0]
     assert np.allclose(strip[[3, 6]], [[0, -0.04, 0], [0, 0.04, 0]])
     assert strip[0, 2] == strip[:, 2].min() < 0  # the stem comes from behind: z is the approach
+
+
+def test_viewer_opens_where_there_is_a_screen_and_stays_on_the_loopback(monkeypatch: pytest.MonkeyPatch) -> None:
+    started: list[list[str]] = []
+    monkeypatch.setenv("DISPLAY", ":0")
+    monkeypatch.setattr("subprocess.Popen", lambda command, **more: started.append(command))
+    port = free_port()
+    Inspector(live=True, port=port).close()
+    (command,) = started
+    assert command[command.index("--bind") + 1] == "127.0.0.1"
+    assert command[-1] == f"rerun+http://127.0.0.1:{port}/proxy"
+
+
+def test_drawn_meshes_are_the_robot_s_within_the_grid() -> None:
+    drawn = {path: entity for path, entity in RobotDrawing().draw_links() if isinstance(entity, rr.Mesh3D)}
+    for stem, link in (("z1_Link01", "link01"), ("z1_GripperMover", "gripperMover")):
+        (mesh,) = (entity for path, entity in drawn.items() if path.endswith(f"{link}/mesh"))
+        assert mesh.vertex_positions is not None
+        vertices = np.array(mesh.vertex_positions.as_arrow_array().to_pylist())
+        whole = trimesh.load_mesh(z1.mesh_dir() / "collision" / f"{stem}.STL")
+        assert np.allclose([vertices.min(axis=0), vertices.max(axis=0)], whole.bounds, atol=0.002)
+        distance, _ = KDTree(vertices).query(whole.vertices)
+        assert distance.max() < 0.002 * np.sqrt(3)
