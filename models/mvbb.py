@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from models.box_axes import min_volume_axes, principal_axes, upright_axes
-from models.obb import DegenerateCloudError, OrientedBox
+from models.obb import FACE_AXES, DegenerateCloudError, OrientedBox
 from models.types import GraspSet
 
 FitMethod = Literal["pca", "min_volume", "upright"]
@@ -71,11 +71,18 @@ def fit_obb(
 
 
 def nearest_faces(box: OrientedBox, k: int, origin: np.ndarray | None = None) -> np.ndarray:
-    """Return the indices (k,) of the faces whose centres are nearest to `origin` (3,), the camera, nearest first."""
-    if not 1 <= k <= 6:
+    """Return the indices (k,) of the faces whose centres are nearest to `origin` (3,), the camera, nearest first.
+
+    The far face of an unobserved axis comes last: where it stands was never seen. By its place in the thin box of
+    a one-face view it would be the second nearest, and let grasps in from behind the object.
+    """
+    if not 1 <= k <= len(FACE_AXES):
         raise ValueError(f"k is {k}; a box has 1 to 6 faces to choose from.")
     offsets = box.face_centers_m - (np.zeros(3) if origin is None else origin)
-    return np.argsort(np.linalg.norm(offsets, axis=1), kind="stable")[:k]
+    distances = np.linalg.norm(offsets, axis=1)
+    turned_away = np.sum(box.face_normals * offsets, axis=1) > 0.0
+    distances[box.unobserved[FACE_AXES] & turned_away] = np.inf
+    return np.argsort(distances, kind="stable")[:k]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -96,7 +96,7 @@ def test_every_method_finds_the_exact_box_of_a_full_grid(method: FitMethod):
 @given(seed=SEEDS, method=st.sampled_from(METHODS))
 def test_every_fit_is_right_handed_and_its_percentile_box_holds_most_points(seed: int, method: FitMethod):
     rng = np.random.default_rng(seed)
-    R = Rotation.random(random_state=seed).as_matrix()
+    R = Rotation.from_quat(rng.normal(size=4)).as_matrix()
     points = make_solid(rng, rng.uniform(0.01, 0.1, 3)) @ R.T + [0, 0, 0.4]
     box = fit_obb(points, method, up=rng.normal(size=3))
     np.testing.assert_allclose(box.R_camera_box.T @ box.R_camera_box, np.eye(3), atol=1e-9)
@@ -111,7 +111,7 @@ def test_pca_and_min_volume_boxes_move_rigidly_with_the_points(seed: int, method
     rng = np.random.default_rng(seed)
     half = np.array([0.03, 0.05, 0.09]) * rng.uniform(0.9, 1.1, 3)
     points = make_solid(rng, half) + np.array([0, 0, 0.4])
-    R, p = Rotation.random(random_state=seed).as_matrix(), rng.uniform(-0.2, 0.2, 3)
+    R, p = Rotation.from_quat(rng.normal(size=4)).as_matrix(), rng.uniform(-0.2, 0.2, 3)
     before, after = fit_obb(points, method), fit_obb(points @ R.T + p, method)
     assert same_corners(before.corners_m @ R.T + p, after.corners_m) < 1e-6
 
@@ -131,7 +131,7 @@ def test_the_order_of_the_points_does_not_matter(seed: int, method: FitMethod):
 def test_no_box_is_smaller_than_the_min_volume_box(seed: int):
     rng = np.random.default_rng(seed)
     half = rng.uniform(0.01, 0.1, 3)
-    points = make_solid(rng, half) @ Rotation.random(random_state=seed).as_matrix().T + [0, 0, 0.5]
+    points = make_solid(rng, half) @ Rotation.from_quat(rng.normal(size=4)).as_matrix().T + [0, 0, 0.5]
     smallest = fit_obb(points, "min_volume", percentile=(0, 100)).volume_m3
     assert smallest <= fit_obb(points, "pca", percentile=(0, 100)).volume_m3 * (1 + 1e-9)
     assert smallest == pytest.approx(8 * np.prod(half), rel=1e-6)
@@ -235,6 +235,14 @@ def test_nearest_faces_are_those_with_the_nearest_true_centers():
     assert nearest_faces(make_box(), 1).tolist() == [5]
     assert nearest_faces(make_box(), 2, origin=np.array([0.5, 0.0, 0.4])).tolist()[0] == 0
     assert sorted(nearest_faces(make_box(), 6).tolist()) == [0, 1, 2, 3, 4, 5]
+
+
+def test_the_never_seen_back_of_a_one_face_view_is_no_near_face():
+    cloud, _ = make_upright_view(np.random.default_rng(1), np.array([0.03, 0.08, 0.05]), 0.0, np.array([0, 0, 0.4]))
+    box = fit_obb(cloud, up=UP)
+    faces = nearest_faces(box, 6)
+    assert box.face_normals[faces[0]] @ [0, 0, 1] < -0.99
+    assert box.face_normals[faces[-1]] @ [0, 0, 1] > 0.99
 
 
 def test_alignment_keeps_exactly_the_grasps_above_zero():
