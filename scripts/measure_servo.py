@@ -145,11 +145,11 @@ def _run_servo(seconds: float) -> tuple[np.ndarray, list[float], int]:
         sender = threading.Thread(target=_swing, args=(servo, ended), daemon=True)
         sender.start()
         clock.sleep_until(clock.now_s() + seconds)
+        count, overruns = servo.count, servo.periods.overruns
         ended.set()
         sender.join()
-        overruns = servo.status().overruns
     servo.disconnect()
-    woke_s, cost_ms = servo.woke_s[: servo.count], servo.cost_ms[: servo.count]
+    woke_s, cost_ms = servo.woke_s[:count], servo.cost_ms[:count]
     return 1e3 * np.diff(woke_s), (1e3 * np.percentile(cost_ms, [50, 99])).tolist(), overruns
 
 
