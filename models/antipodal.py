@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from models.surfels import Surfels, estimate_normals, find_outline, guess_hidden_sides, smooth_normals
 from models.types import GraspSet
@@ -102,7 +102,7 @@ class AntipodalSampler:
     def _find_surfels(self, points: np.ndarray, rng: np.random.Generator) -> Surfels:
         """Return contacts on the visible surface and on the sides behind its outline."""
         config = self.config
-        tree = cKDTree(points)
+        tree = KDTree(points)
         at = points[rng.permutation(len(points))[: config.n_surfels]]
         rim, outward = find_outline(points)
         keep = rng.permutation(len(rim))[: config.n_hidden]

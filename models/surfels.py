@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 _NORMAL_NEIGHBORS = 30
 _MIN_DEPTH_M = 1e-3
@@ -32,7 +32,7 @@ class Surfels:
     """(K, 3) outward unit normals, estimated or guessed."""
 
 
-def estimate_normals(tree: cKDTree, at: np.ndarray) -> np.ndarray:
+def estimate_normals(tree: KDTree, at: np.ndarray) -> np.ndarray:
     """Return unit normals (K, 3) of the cloud in `tree` at points `at` (K, 3), turned to the camera at the origin."""
     _, neighbors = tree.query(at, k=min(_NORMAL_NEIGHBORS, tree.n))
     patches = tree.data[neighbors]
@@ -60,7 +60,7 @@ def find_outline(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             "all of it in front. Give it in the camera frame."
         )
     bearings = in_view[:, :2] / in_view[:, 2:]
-    tree = cKDTree(bearings)
+    tree = KDTree(bearings)
     gaps, _ = _widest_gap(tree, bearings, _OUTLINE_NEIGHBORS)
     rim = np.flatnonzero(gaps > _OUTLINE_GAP_RAD)
     gaps, angles = _widest_gap(tree, bearings[rim], _EDGE_NEIGHBORS)
@@ -74,7 +74,7 @@ def find_outline(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def guess_hidden_sides(
-    points: np.ndarray, tree: cKDTree, rim: np.ndarray, outward: np.ndarray, setback_m: float
+    points: np.ndarray, tree: KDTree, rim: np.ndarray, outward: np.ndarray, setback_m: float
 ) -> Surfels:
     """Guess the surface just behind the outline.
 
@@ -113,7 +113,7 @@ def smooth_normals(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
     """
     if len(points) < 2:
         return normals
-    distances, neighbors = cKDTree(points).query(points, k=min(_SMOOTHING_NEIGHBORS, len(points)))
+    distances, neighbors = KDTree(points).query(points, k=min(_SMOOTHING_NEIGHBORS, len(points)))
     near = normals[neighbors]
     alike = np.einsum("kni,ki->kn", near, normals) > np.cos(_SMOOTHING_RAD)
     weights = alike & (distances < _SMOOTHING_RADIUS_M)
@@ -129,10 +129,10 @@ def _view_basis(points: np.ndarray) -> np.ndarray:
     return np.stack([right, np.cross(forward, right), forward])
 
 
-def _widest_gap(tree: cKDTree, at: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
+def _widest_gap(tree: KDTree, at: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the widest empty sector (K,) [rad] around `at` (K, 2) among its k neighbours, and its middle (K,)."""
     _, neighbors = tree.query(at, k=min(k + 1, tree.n))
-    offsets = tree.data[neighbors[:, 1:]] - at[:, None]
+    offsets = tree.data[np.asarray(neighbors)[:, 1:]] - at[:, None]
     angles = np.sort(np.arctan2(offsets[..., 1], offsets[..., 0]), axis=1)
     gaps = np.diff(angles, axis=1, append=angles[:, :1] + 2.0 * np.pi)
     widest = np.argmax(gaps, axis=1)
@@ -148,7 +148,7 @@ def _square_to_rim(rim: np.ndarray, outward_rad: np.ndarray) -> np.ndarray:
     """
     if len(rim) < _RIM_NEIGHBORS:
         return np.full(len(rim), np.nan)
-    _, neighbors = cKDTree(rim).query(rim, k=_RIM_NEIGHBORS)
+    _, neighbors = KDTree(rim).query(rim, k=_RIM_NEIGHBORS)
     offsets = rim[neighbors] - rim[neighbors].mean(axis=1, keepdims=True)
     across = np.linalg.eigh(np.einsum("kni,knj->kij", offsets, offsets))[1][:, :, 0]
     coarse = np.stack([np.cos(outward_rad), np.sin(outward_rad)], axis=1)

@@ -153,10 +153,10 @@ def test_a_narrower_jaw_gives_no_wider_grasp():
 
 
 def test_normals_of_a_cylinder_point_out_of_it_and_to_the_camera():
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     cloud = make_cylinder_view()
-    normals = estimate_normals(cKDTree(cloud), cloud)
+    normals = estimate_normals(KDTree(cloud), cloud)
     outward = (cloud - CENTER) * [1.0, 0.0, 1.0]
     outward /= np.linalg.norm(outward, axis=1, keepdims=True)
     inner = np.abs(cloud[:, 0] - CENTER[0]) < 0.8 * RADIUS_M
@@ -173,10 +173,10 @@ def test_the_outline_of_a_front_face_is_its_four_edges_without_the_corners():
 
 
 def test_the_side_behind_a_flat_edge_is_square_to_the_face_and_behind_it():
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     cloud = make_front_view()
     rim, outward = find_outline(cloud)
-    sides = guess_hidden_sides(cloud, cKDTree(cloud), rim, outward, 0.008)
+    sides = guess_hidden_sides(cloud, KDTree(cloud), rim, outward, 0.008)
     assert np.median(np.abs(sides.normals[:, 2])) < np.sin(np.deg2rad(5))
     assert np.median(sides.points[:, 2] - cloud[rim, 2]) == pytest.approx(0.008, abs=1e-3)
