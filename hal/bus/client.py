@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 import uuid
 from types import TracebackType
@@ -18,6 +19,8 @@ from hal.bus.session import BusConfig
 from hal.clock import Clock, WallClock
 from hal.errors import HalTimeoutError, NotConnectedError
 from hal.messages import ArmSetpoint, ArmState, ServoStatus, TrajectoryChunk
+
+_LOG = logging.getLogger(__name__)
 
 
 class RemoteArm:
@@ -196,6 +199,9 @@ class _Heart:
 
     def _beat(self) -> None:
         beat = self.owner.encode()
-        while not self._end.wait(self._period_s):
-            self._publisher.put(beat)
-        self._publisher.undeclare()
+        try:
+            while not self._end.wait(self._period_s):
+                self._publisher.put(beat)
+            self._publisher.undeclare()
+        except zenoh.ZError as err:  # the session was closed, as at the end of the process
+            _LOG.debug("the heartbeat ends: %s", err)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import threading
 
 import zenoh
@@ -41,6 +42,8 @@ class Link:
         before = existing_segments()
         self.session = open_session(config, listen=False)
         self._segments = mapped_segments() - before
+        # With a session left open Zenoh hangs at exit.
+        atexit.register(self.close)
         try:
             self.hello, self.clock_offset_s = self._greet()
         except HalError:
@@ -72,6 +75,7 @@ class Link:
 
     def close(self) -> None:
         """End the session."""
+        atexit.unregister(self.close)
         self.session.close()
         unlink_segments(self._segments)
 

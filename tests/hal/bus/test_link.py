@@ -156,7 +156,7 @@ def test_a_stop_gets_through_while_another_query_is_stuck(hal, remote_arm, monke
 
     def slow_rearm() -> None:
         stuck.set()
-        let_go.wait()
+        let_go.wait(5.0)
 
     monkeypatch.setattr(hal.servo, "rearm", slow_rearm)
     with RemoteArm(hal.config) as other:
@@ -172,8 +172,8 @@ def test_a_stop_gets_through_while_another_query_is_stuck(hal, remote_arm, monke
         asking.start()
         assert stuck.wait(10)
         remote_arm.stop("now")
-        assert hal.servo.status().reason == "now"
-        assert not let_go.is_set()
+        wait_until(lambda: hal.servo.status().reason == "now", 3.0)
+        assert asking.is_alive() or errors
         asking.join()
         assert "no answer" in str(errors[0])
         let_go.set()
@@ -234,8 +234,14 @@ def test_frames_arrive_pixel_by_pixel_through_shared_memory_and_without(hal):
     for shared in (True, False):
         config = BusConfig(port=hal.config.port, shared_memory=shared)
         with RemoteCamera(config) as camera:
+            # A full pool sends single frames as bytes, so shared memory may take more than one frame to show.
             frame = camera.wait_for_frame(2.0)
-            assert camera.shared_memory is (shared and hal.server.uses_shared_memory)
+            if shared and hal.server.uses_shared_memory:
+                frame = wait_until(
+                    lambda camera=camera: (f := camera.wait_for_frame(2.0)) and camera.shared_memory and f
+                )
+            else:
+                assert not camera.shared_memory
             np.testing.assert_array_equal(frame.colour, originals[frame.sequence].colour)
             np.testing.assert_array_equal(frame.depth_m, originals[frame.sequence].depth_m)
 
@@ -271,7 +277,7 @@ def test_a_gap_in_the_sequence_is_counted(hal, remote_camera):
 
 def test_without_room_in_shared_memory_frames_go_as_bytes_with_one_warning(hal, monkeypatch, caplog):
     class Full:
-        f_bavail, f_frsize = 100, 4096
+        f_bavail, f_frsize = 0, 4096
 
     monkeypatch.setattr("hal.bus.frames.os.statvfs", lambda _: Full)
     with caplog.at_level(logging.WARNING):
@@ -314,7 +320,7 @@ def test_an_unreadable_owner_is_refused_everywhere_but_at_the_stop(hal, intruder
             assert reply.ok is not None
         else:
             assert type(decode_error(reply.err.payload.to_bytes())) is InvalidMessageError
-    assert hal.servo.status().mode in (ServoMode.STOPPED, ServoMode.BRAKING)
+    wait_until(lambda: hal.servo.status().mode is ServoMode.STOPPED)
     assert "stop requested" in hal.servo.status().reason
 
 
@@ -326,7 +332,8 @@ def test_a_strangers_heartbeat_keeps_no_motion_alive_and_breaks_nothing(hal, int
 
     def stopped() -> bool:
         publisher.put(beat)
-        return hal.servo.status().mode is ServoMode.HOLDING
+        status = hal.servo.status()
+        return status.mode is ServoMode.HOLDING and status.reason != ""
 
     wait_until(stopped)
     assert "heartbeat" in hal.servo.status().reason

