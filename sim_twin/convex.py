@@ -16,6 +16,7 @@ JAW_LINKS = ("gripperStator", "gripperMover")
 _PIVOT_IN_STATOR_M = 0.049  # URDF, jointGripper
 # Corners are rounded to a grid, which leaves far fewer of them: 0.1 mm of error at the jaws, 1 mm at the links.
 _JAW_GRID_M, _LINK_GRID_M = 2e-4, 2e-3
+_VISUAL_GRID_M = 8e-4
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -68,6 +69,17 @@ def load_link_mesh(link: str) -> trimesh.Trimesh:
     """
     stem = link[0].upper() + link[1:] if link.startswith(("link", "gripper")) else link
     return trimesh.load_mesh(z1.mesh_dir() / "collision" / f"z1_{stem}.STL")
+
+
+@cache
+def load_visual_mesh(link: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return vertices (V, 3) [m] and faces (F, 3) of a link for pictures: the mesh without its finest fillets."""
+    mesh = load_link_mesh(link)
+    cells = np.round(mesh.vertices / _VISUAL_GRID_M).astype(np.int64)
+    _, first, cell_of = np.unique(cells, axis=0, return_index=True, return_inverse=True)
+    faces = cell_of.reshape(-1)[mesh.faces]
+    flat = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
+    return np.asarray(mesh.vertices)[first], faces[~flat]
 
 
 @cache

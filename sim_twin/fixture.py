@@ -25,7 +25,6 @@ class Fixture:
         self._id = model.equality(FIXTURE).id
         self._object = model.body(OBJECT_BODY).id
         self._jaws = [model.body(name).id for name in JAW_LINKS]
-        self._world_bodies = {0}
         self._start = model.body(OBJECT_BODY).pos.copy()
 
     def update(self, model: mujoco.MjModel, data: mujoco.MjData) -> bool:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 import os
+import threading
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -27,6 +28,7 @@ RENDERERS = ("auto", "egl", "rays")
 
 _NEAR_M, _FAR_M = 0.01, 20.0
 _warned = False
+_context_lock = threading.Lock()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -183,9 +185,10 @@ def _decode(ids: np.ndarray, inverse_z: np.ndarray, is_object: np.ndarray) -> tu
 
 def make_context(model: mujoco.MjModel, width: int, height: int, samples: int) -> mujoco.MjrContext:
     """Return a drawing context whose offscreen buffer is exactly (height, width); a GL context must be current."""
-    sizes = model.vis.global_
-    sizes.offwidth, sizes.offheight = width, height
-    model.vis.quality.offsamples = samples
-    context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+    with _context_lock:  # the size travels in the model, which several threads may share
+        sizes = model.vis.global_
+        sizes.offwidth, sizes.offheight = width, height
+        model.vis.quality.offsamples = samples
+        context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
     mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, context)
     return context

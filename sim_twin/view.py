@@ -9,9 +9,9 @@ from hal.errors import CameraError
 from sim_twin.render import make_context
 from sim_twin.z1_mjcf import GROUP_MOUNT, GROUP_SCENE, GROUP_VISUAL
 
-_LOOK_AT_M = (0.26, 0.0, 0.17)
-_DISTANCE_M = 1.05
-_AZIMUTH_DEG, _ELEVATION_DEG = 128.0, -17.0
+_LOOK_AT_M = (0.25, 0.0, 0.19)
+_DISTANCE_M = 0.90
+_AZIMUTH_DEG, _ELEVATION_DEG = 122.0, -14.0
 _SAMPLES = 8
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from hal import z1
 from sim_twin.fixture import Fixture
-from sim_twin.objects import OBJECT_BODY, OBJECTS
+from sim_twin.objects import OBJECTS
 from sim_twin.scene import PHYSICS_PERIOD_S, SceneConfig, build_model
 
 GRIPPER_START_RAD = -1.0
@@ -30,7 +30,6 @@ class World:
         self._lock = threading.RLock()
         self._steps = 0
         self._corners = OBJECTS[config.object].corners()
-        self._object_id = self.model.body(OBJECT_BODY).id
         self._fixture = Fixture(self.model) if config.pitch_deg != 0 else None
         start = np.append(z1.Q_HOME, GRIPPER_START_RAD)
         self.data.qpos[: z1.N_JOINTS] = start

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from hal import z1
-from sim_twin.convex import JAW_LINKS, load_link_mesh, split_convex
+from sim_twin.convex import JAW_LINKS, load_visual_mesh, split_convex
 
 GROUP_SCENE = 0
 """Table and object: seen by every camera, collides."""
@@ -124,11 +124,11 @@ def _add_servo(spec: mujoco.MjSpec, index: int) -> None:
 
 
 def _add_geoms(spec: mujoco.MjSpec, body: mujoco.MjsBody, name: str) -> None:
-    mesh = load_link_mesh(name)
+    vertices, faces = load_visual_mesh(name)
     jaw = name in JAW_LINKS
     rgba = _LINK_RGBA["jaw" if jaw else "dark" if name in ("link00", "link04", "link06") else "link"]
     visual = spec.add_mesh(name=f"{name}_visual", inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL)
-    visual.uservert, visual.userface = mesh.vertices.ravel(), mesh.faces.ravel()
+    visual.uservert, visual.userface = vertices.ravel(), faces.ravel()
     body.add_geom(
         name=f"{name}_visual",
         type=mujoco.mjtGeom.mjGEOM_MESH,

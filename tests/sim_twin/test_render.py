@@ -1,0 +1,114 @@
+import logging
+from itertools import product
+
+import mujoco
+import numpy as np
+import pytest
+
+from hal.errors import CameraError
+from sim_twin import render
+from sim_twin.d405 import INTRINSICS, MIN_Z_M, measure_depth
+from sim_twin.objects import OBJECT_NAMES
+from sim_twin.render import RENDER_VARIABLE, View, make_renderer
+from sim_twin.scene import SceneConfig
+from sim_twin.world import World
+
+
+def _has_egl() -> bool:
+    try:
+        from mujoco.egl import GLContext
+
+        GLContext(16, 16).free()
+    except (ImportError, AttributeError, RuntimeError):
+        return False
+    return True
+
+
+needs_egl = pytest.mark.skipif(not _has_egl(), reason="no OpenGL through EGL on this machine")
+
+
+def _draw(config: SceneConfig, kind: str) -> View:
+    world = World(config)
+    renderer = make_renderer(world.model, INTRINSICS, kind)
+    view = renderer.render(world.snapshot())
+    renderer.close()
+    return view
+
+
+@needs_egl
+@pytest.mark.parametrize("name", OBJECT_NAMES)
+def test_rays_and_egl_see_the_same_depth_and_the_same_object(name: str) -> None:
+    config = SceneConfig(object=name, pitch_deg=20.0, lateral_m=0.05)
+    egl, rays = _draw(config, "egl"), _draw(config, "rays")
+    assert (egl.mask & rays.mask).sum() / (egl.mask | rays.mask).sum() > 0.99
+    valid = (egl.z_m > 0) & (rays.z_m > 0)
+    assert valid.sum() > 0.995 * max((egl.z_m > 0).sum(), (rays.z_m > 0).sum())
+    error = np.abs(egl.z_m - rays.z_m)[valid]
+    assert np.median(error) < 2e-5
+    assert np.percentile(error, 99) < 2e-3  # OpenGL draws cylinders with flat facets, and edges half a pixel apart
+
+
+@needs_egl
+def test_the_table_is_where_the_pinhole_and_the_mount_say() -> None:
+    world = World(SceneConfig(object="cylinder"))
+    data = world.snapshot()
+    renderer = make_renderer(world.model, INTRINSICS, "egl")
+    view = renderer.render(data)
+    renderer.close()
+    v, u = np.mgrid[150:260:10, 30:250:10]
+    z = view.z_m[v, u]
+    points = np.stack([(u - INTRINSICS.cx) / INTRINSICS.fx * z, (v - INTRINSICS.cy) / INTRINSICS.fy * z, z], axis=-1)
+    R_base_camera = data.cam("wrist").xmat.reshape(3, 3) * [1, -1, -1]
+    height = points.reshape(-1, 3) @ R_base_camera[2] + data.cam("wrist").xpos[2]
+    np.testing.assert_allclose(height, 0.0, atol=2e-4)
+
+
+@needs_egl
+@pytest.mark.parametrize("name", OBJECT_NAMES)
+def test_from_home_every_object_is_seen_past_the_open_jaws_and_beyond_min_z(name: str) -> None:
+    world = World(SceneConfig(object=name))
+    data = world.snapshot()
+    renderer = make_renderer(world.model, INTRINSICS, "egl")
+    for distance_m, lateral_m, pitch_deg in product((0.40, 0.56), (-0.15, 0.15), (-45.0, 0.0, 45.0)):
+        config = SceneConfig(object=name, distance_m=distance_m, lateral_m=lateral_m, pitch_deg=pitch_deg)
+        half = np.deg2rad(pitch_deg) / 2
+        data.qpos[7:] = [*config.T_base_object()[:3, 3], np.cos(half), 0.0, np.sin(half), 0.0]
+        mujoco.mj_kinematics(world.model, data)
+        view = renderer.render(data)
+        assert view.z_m[view.mask].min() > 2 * MIN_Z_M, config
+        depth = measure_depth(view.z_m, seed=0, sequence=1)
+        assert (depth[view.mask] > 0).sum() > 2000, config
+        if distance_m > 0.5:  # nearer, a leaning object reaches the image's border
+            rows, columns = np.nonzero(view.mask)
+            assert 0 < rows.min() <= rows.max() < INTRINSICS.height - 1, config
+            assert 0 < columns.min() <= columns.max() < INTRINSICS.width - 1, config
+    renderer.close()
+
+
+def test_the_wrist_camera_does_not_see_its_own_housing() -> None:
+    z_m = _draw(SceneConfig(object="cylinder"), "rays").z_m
+    assert z_m[z_m > 0].min() > 0.04  # the gripper's back; the housing begins at 0 and the bracket behind it
+    assert z_m[:200][z_m[:200] > 0].min() > 0.2
+
+
+def test_an_unknown_renderer_is_refused_with_the_known_ones(monkeypatch: pytest.MonkeyPatch, world: World) -> None:
+    monkeypatch.setenv(RENDER_VARIABLE, "vulkan")
+    with pytest.raises(ValueError, match="auto, egl, rays"):
+        make_renderer(world.model, INTRINSICS)
+
+
+def test_without_egl_rays_are_cast_with_one_warning(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, world: World
+) -> None:
+    def fail(*_: object) -> None:
+        raise ImportError("no libEGL")
+
+    monkeypatch.setattr(render, "EglRenderer", fail)
+    monkeypatch.setattr(render, "_warned", False)
+    monkeypatch.delenv(RENDER_VARIABLE, raising=False)
+    with caplog.at_level(logging.WARNING):
+        kinds = [type(make_renderer(world.model, INTRINSICS)).__name__ for _ in range(2)]
+    assert kinds == ["RayRenderer", "RayRenderer"]
+    assert len([record for record in caplog.records if "casts rays" in record.message]) == 1
+    with pytest.raises(CameraError, match="libegl1"):
+        make_renderer(world.model, INTRINSICS, "egl")
