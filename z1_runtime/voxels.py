@@ -163,14 +163,24 @@ def _near_points(asked, threshold, points, origin, shape, block_of, near, head, 
 def _query(T, vertices, threshold, points, origin, shape, block_of, near, head, after):
     hit_vertex = np.full(T.shape[0], -1, dtype=np.int64)
     hit_point = np.full(T.shape[0], -1, dtype=np.int64)
+    # In units of blocks from the index's corner, so that the loop over empty space is nine products and one look-up
+    scale = 1.0 / _BLOCK_M
+    n_i, n_j, n_k = float(shape[0]), float(shape[1]), float(shape[2])
     for n in range(T.shape[0]):
-        r = T[n]
+        xx, xy, xz, x0 = T[n, 0, 0] * scale, T[n, 0, 1] * scale, T[n, 0, 2] * scale, (T[n, 0, 3] - origin[0]) * scale
+        yx, yy, yz, y0 = T[n, 1, 0] * scale, T[n, 1, 1] * scale, T[n, 1, 2] * scale, (T[n, 1, 3] - origin[1]) * scale
+        zx, zy, zz, z0 = T[n, 2, 0] * scale, T[n, 2, 1] * scale, T[n, 2, 2] * scale, (T[n, 2, 3] - origin[2]) * scale
         for v in range(vertices.shape[0]):
             a, b, c = vertices[v, 0], vertices[v, 1], vertices[v, 2]
-            x = r[0, 0] * a + r[0, 1] * b + r[0, 2] * c + r[0, 3]
-            y = r[1, 0] * a + r[1, 1] * b + r[1, 2] * c + r[1, 3]
-            z = r[2, 0] * a + r[2, 1] * b + r[2, 2] * c + r[2, 3]
-            m = _touch_if_near(x, y, z, threshold, points, origin, shape, block_of, near, head, after)
+            i = xx * a + xy * b + xz * c + x0
+            j = yx * a + yy * b + yz * c + y0
+            k = zx * a + zy * b + zz * c + z0
+            if i < 0.0 or j < 0.0 or k < 0.0 or i >= n_i or j >= n_j or k >= n_k or not near[int(i), int(j), int(k)]:
+                continue
+            x = T[n, 0, 0] * a + T[n, 0, 1] * b + T[n, 0, 2] * c + T[n, 0, 3]
+            y = T[n, 1, 0] * a + T[n, 1, 1] * b + T[n, 1, 2] * c + T[n, 1, 3]
+            z = T[n, 2, 0] * a + T[n, 2, 1] * b + T[n, 2, 2] * c + T[n, 2, 3]
+            m = _touches(x, y, z, threshold, points, shape, block_of, head, after, origin[0], origin[1], origin[2])
             if m >= 0:
                 hit_vertex[n], hit_point[n] = v, m
                 break

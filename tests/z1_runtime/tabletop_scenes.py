@@ -14,6 +14,7 @@ from z1_runtime.types import Observation, Plane
 
 Q_START = np.append(z1.Q_HOME, -1.0)
 RADIUS_M, HEIGHT_M = 0.030, 0.150
+N_POINTS = 16_000  # 1.3 mm apart, as the D405 sees it at 0.4 m
 
 
 def camera_pose(kinematics: Kinematics) -> np.ndarray:
@@ -27,9 +28,9 @@ def moved(T: np.ndarray, points: np.ndarray) -> np.ndarray:
 def cylinder(x: float, y: float, eye: np.ndarray, radius: float = RADIUS_M, height: float = HEIGHT_M) -> np.ndarray:
     """Return the points of an upright cylinder that `eye` (3,) sees, base frame."""
     rng = np.random.default_rng(0)
-    angle, z = rng.uniform(0.0, 2.0 * np.pi, 4000), rng.uniform(0.008, height, 4000)
-    outward = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(4000)])
-    side = radius * outward + np.column_stack([np.full(4000, x), np.full(4000, y), z])
+    angle, z = rng.uniform(0.0, 2.0 * np.pi, N_POINTS), rng.uniform(0.008, height, N_POINTS)
+    outward = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(N_POINTS)])
+    side = radius * outward + np.column_stack([np.full(N_POINTS, x), np.full(N_POINTS, y), z])
     return side[np.sum((eye - side) * outward, axis=1) > 0.0]
 
 

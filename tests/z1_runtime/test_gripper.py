@@ -26,7 +26,7 @@ def surface(name: str, offset_x: float) -> np.ndarray:
     """Return dense points of a jaw's mesh in the pivot frame, closed."""
     mesh = trimesh.load_mesh(z1.mesh_dir() / "collision" / f"{name}.STL")
     points = np.asarray(trimesh.sample.sample_surface(mesh, 60_000, seed=0)[0])
-    return points + [offset_x, 0.0, 0.0]
+    return points + np.array([offset_x, 0.0, 0.0])
 
 
 @pytest.fixture(scope="module")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from tabletop_scenes import (
@@ -65,7 +67,7 @@ def test_a_standing_cylinder_is_planned_wherever_it_may_stand(planner, kinematic
     plan = planner.plan(candidates(observation, x, y), observation, Q_START)
     legs = (plan.transfer, plan.approach, plan.close, plan.lift)
     assert plan.transfer.q[0] == pytest.approx(Q_START)
-    for before, after in zip(legs, legs[1:], strict=False):
+    for before, after in pairwise(legs):
         assert after.q[0] == pytest.approx(before.q[-1], abs=1e-9)
     for leg in legs:
         assert (leg.q >= z1.Q_MIN - 1e-9).all()
