@@ -24,6 +24,7 @@ from scripts.demo_robot import DemoRobot, HalProcess, lockstep_robot, remote_rob
 from sim_twin.scene import SceneConfig
 from z1_runtime.assembly import make_decider
 from z1_runtime.config import load_config, save_config
+from z1_runtime.frame_tap import FrameTap
 from z1_runtime.inspect import Inspector
 from z1_runtime.pipeline import Phase, PickPipeline, PickRecord
 
@@ -100,6 +101,8 @@ def main(config: Config) -> int:
         )
         robot.arm.claim("demo")
         undo.callback(robot.arm.release)
+        if process:
+            undo.enter_context(FrameTap(robot.camera, robot.arm, inspector))
         summary = _identity(config)
         try:
             summary |= summarise(robot, pipeline.pick())

@@ -20,6 +20,7 @@ from hal.bus.session import BusConfig
 from hal.clock import WallClock
 from z1_runtime.assembly import make_decider
 from z1_runtime.config import load_config
+from z1_runtime.frame_tap import FrameTap
 from z1_runtime.inspect import Inspector
 from z1_runtime.pipeline import PickPipeline
 
@@ -64,6 +65,7 @@ def main(config: Config) -> int:
             config=runtime,
             on_phase=lambda phase: console.print(f"  {phase.name:<9} {phase.duration_s:6.2f} s"),
         )
+        undo.enter_context(FrameTap(camera, arm, inspector))
         arm.claim("run")
         undo.callback(arm.release)
         record = pipeline.pick()

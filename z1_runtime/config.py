@@ -58,6 +58,12 @@ class RuntimeConfig:
 
     def __post_init__(self) -> None:
         _require(1 <= self.n_candidates <= 20_000, "n_candidates", self.n_candidates, "1 to 20000")
+        _require(
+            self.box_method in ("upright", "pca", "min_volume"),
+            "box_method",
+            self.box_method,
+            "upright, pca or min_volume",
+        )
         _require(1 <= self.k_faces <= 6, "k_faces", self.k_faces, "1 to 6")
         _require(0.0 <= self.alpha <= 1.0, "alpha", self.alpha, "0 to 1")
         _require(0.0 < self.speed <= 1.0, "speed", self.speed, "above 0, up to 1")
@@ -96,19 +102,24 @@ def _overlay(default: T, data: Any, where: str) -> T:
             near = difflib.get_close_matches(str(key), known, n=1)
             hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(known)}."
             raise ConfigError(f"{where} has an unknown key {key!r}; {hint}")
-        old = known[key]
-        if is_dataclass(old):
-            values[key] = _overlay(old, value, f"{where}: {key}")
-        elif isinstance(old, float) and isinstance(value, int) and not isinstance(value, bool):
-            values[key] = float(value)
-        elif old is not None and type(value) is not type(old) and not isinstance(old, tuple):
-            raise ConfigError(f"{where}: {key} is {value!r}; it must be a {type(old).__name__}, such as {old!r}.")
-        else:
-            values[key] = tuple(value) if isinstance(old, tuple) else value
+        values[key] = _converted(known[key], value, f"{where}: {key}")
     try:
         return replace(default, **values)  # type: ignore[type-var]
     except ValueError as err:
         raise ConfigError(f"{where}: {err}") from err
+
+
+def _converted(old: Any, value: Any, where: str) -> Any:
+    """Return `value` in the type that `old` has."""
+    if is_dataclass(old):
+        return _overlay(old, value, where)
+    if isinstance(old, tuple) and isinstance(value, list) and len(value) == len(old):
+        return tuple(_converted(o, v, where) for o, v in zip(old, value, strict=True))
+    if isinstance(old, float) and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    if type(value) is not type(old):
+        raise ConfigError(f"{where} is {value!r}; it must be a {type(old).__name__}, such as {old!r}.")
+    return value
 
 
 def _require(ok: bool, name: str, seen: object, allowed: str) -> None:

@@ -1,0 +1,60 @@
+"""Configuration: defaults, file over defaults, and errors that name the key."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import pytest
+
+from z1_runtime.config import ConfigError, RuntimeConfig, load_config, save_config
+
+
+def test_without_a_file_the_defaults_are_in_force() -> None:
+    assert load_config() == RuntimeConfig()
+
+
+def test_a_saved_configuration_reads_back_equal(tmp_path: Path) -> None:
+    config = replace(RuntimeConfig(), n_candidates=77, speed=0.3, box_method="pca")
+    save_config(config, tmp_path / "c.yaml")
+    assert load_config(tmp_path / "c.yaml") == config
+
+
+def test_a_file_changes_only_what_it_names(tmp_path: Path) -> None:
+    path = tmp_path / "c.yaml"
+    path.write_text("speed: 1\nplanner:\n  lift_m: 0.2\nperception:\n  clip_percent: [2, 98]\n")
+    config = load_config(path)
+    assert (config.speed, config.planner.lift_m, config.perception.clip_percent) == (1.0, 0.2, (2.0, 98.0))
+    changed = asdict(config)
+    default = asdict(RuntimeConfig())
+    for tree in (changed, default):
+        del tree["speed"], tree["planner"]["lift_m"], tree["perception"]["clip_percent"]
+    assert changed == default
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("sped: 0.5", "did you mean 'speed'"),
+        ("speed: fast", "speed is 'fast'"),
+        ("speed: 7", "above 0, up to 1"),
+        ("planner:\n  lift: 0.2", "'lift'"),
+        ("planner: 3", "keys and values"),
+        ("n_candidates: true", "n_candidates is True"),
+        ("perception:\n  clip_percent: [1]", "clip_percent"),
+        ("box_method: sphere", "box_method"),
+        ("- 1", "keys and values"),
+        ("a: [", "not YAML"),
+    ],
+)
+def test_a_wrong_file_is_refused_with_the_key(tmp_path: Path, text: str, said: str) -> None:
+    path = tmp_path / "c.yaml"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=r"c\.yaml") as caught:
+        load_config(path)
+    assert said in str(caught.value)
+
+
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"nowhere\.yaml"):
+        load_config(tmp_path / "nowhere.yaml")

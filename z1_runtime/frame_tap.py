@@ -1,0 +1,60 @@
+"""Shows what the camera sees while the arm moves; a thread of its own, which nobody waits for."""
+
+from __future__ import annotations
+
+import logging
+import threading
+
+import numpy as np
+
+from hal import z1
+from hal.arm import Arm
+from hal.camera import Camera
+from hal.errors import HalError
+from z1_runtime.inspect import Inspector
+from z1_runtime.kinematics import Kinematics
+
+_LOG = logging.getLogger(__name__)
+_PATIENCE_S = 1.0
+
+
+class FrameTap:
+    """Hands every frame it can get to the inspector, with the camera's pose at that moment.
+
+    For devices that live by the wall clock; in lock-step, waiting for a frame would move time.
+
+    Args:
+        camera: connected; others may wait for its frames too.
+        arm: connected.
+        inspector: gets the frames.
+        T_flange_camera: (4, 4) hand-eye transform.
+    """
+
+    def __init__(
+        self, camera: Camera, arm: Arm, inspector: Inspector, T_flange_camera: np.ndarray = z1.T_FLANGE_CAMERA
+    ) -> None:
+        self._camera = camera
+        self._arm = arm
+        self._inspector = inspector
+        self._T_flange_camera = T_flange_camera
+        self._kinematics = Kinematics()
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="frame tap", daemon=True)
+
+    def __enter__(self) -> FrameTap:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._closing.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        while not self._closing.is_set():
+            try:
+                frame = self._camera.wait_for_frame(_PATIENCE_S)
+                q = self._arm.read_state().q[: z1.N_ARM]
+            except HalError as err:
+                _LOG.warning("no more frames are shown: %s", err)
+                return
+            self._inspector.log_frame(frame, self._kinematics.flange(q) @ self._T_flange_camera)
