@@ -40,8 +40,9 @@ class ServoLimits:
     """A motor above this part of `tau_max` for `overload_s` is overloaded."""
     overload_s: float = 0.1
     """See `overload_fraction` [s]."""
-    brake_s: float = 0.38
-    """Braking takes no longer; when `ddq_max` cannot do that, it brakes harder [s]."""
+    brake_s: float = 0.24
+    """Braking takes no longer; when `ddq_max` cannot do that, it brakes harder [s]. With the 0.15 s after which an
+    owner counts as lost (`hal.process`), the command rests 0.4 s after the owner's last sign of life."""
 
     def __post_init__(self) -> None:
         for entry in fields(self):

@@ -18,7 +18,7 @@ from hal.servo import Servo
 from hal.servo_thread import ServoThread
 
 _LOG = logging.getLogger(__name__)
-HEARTBEAT_TIMEOUT_S = 0.1
+HEARTBEAT_TIMEOUT_S = 0.15
 """How long the owner may be silent in motion [s]."""
 _BRAKING_S = 2.0
 _LOOK_S = 0.05

@@ -27,7 +27,7 @@ class RemoteArm:
     """The servoed arm of a HAL process (`hal.arm.ServoedArm`).
 
     While it holds the lease it sends the heartbeat from a thread of its own: should this process die, or hold the
-    interpreter for longer than 0.1 s in one piece, the servo brakes.
+    interpreter for longer than 0.15 s in one piece, the servo brakes.
 
     Args:
         config: where the HAL process is.

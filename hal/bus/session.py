@@ -35,7 +35,7 @@ class BusConfig:
     state_rate_hz: float = 100.0
     """How often the HAL publishes state and status [Hz]."""
     heartbeat_rate_hz: float = 50.0
-    """How often the owner of the lease says that it lives [Hz]; the servo brakes after 0.1 s of silence."""
+    """How often the owner of the lease says that it lives [Hz]; the servo brakes after 0.15 s of silence."""
     shared_memory: bool = True
     """Whether frames go through shared memory where both ends can."""
 

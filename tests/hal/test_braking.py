@@ -16,9 +16,9 @@ ZERO = np.zeros(N_JOINTS)
 
 @pytest.mark.parametrize("ddq", [-DDQ_MAX, ZERO, DDQ_MAX])
 @pytest.mark.parametrize("dq", [-DQ_MAX, 0.3 * DQ_MAX, DQ_MAX])
-def test_a_stop_from_any_speed_and_acceleration_is_over_in_0_4_s(dq: np.ndarray, ddq: np.ndarray) -> None:
+def test_a_stop_from_any_speed_and_acceleration_is_over_in_time(dq: np.ndarray, ddq: np.ndarray) -> None:
     path = Brake(LIMITS).plan(np.zeros(N_JOINTS) + MIDDLE, dq, ddq)
-    assert path.duration_s < 0.4
+    assert path.duration_s <= ServoLimits().brake_s
     assert path.at(10.0)[1] == pytest.approx(ZERO, abs=1e-9)
 
 
