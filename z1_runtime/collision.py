@@ -27,6 +27,7 @@ _PAIRS = np.array(
         if one.link == link and other.link in others
     ]
 )
+_RIM_M, _DROP_STEP_M = 0.010, 0.002
 _SELF_VERTICES = 400  # heads of the gripper's points that are tried against the capsules, which have 10 mm to spare
 
 
@@ -50,6 +51,8 @@ class CollisionConfig:
     """Scene points nearer than this to the object are its own border [m]."""
     robot_halo_m: float = 0.010
     """Scene points nearer than this to gripper and camera, as they were when the frame was taken, are those [m]."""
+    cut_off_m: float = 0.015
+    """An object whose lowest seen points are higher than this over the table goes on below them [m]."""
     sample_s: float = 0.016
     """Time between two checked samples of a trajectory [s]."""
 
@@ -112,12 +115,27 @@ class CollisionChecker:
         T_base_camera = observation.T_base_camera
         self.table = plane_in_base(observation.table, T_base_camera)
         self.object_points = _moved(T_base_camera, observation.object_points)
-        self.object_index = SceneIndex(self.object_points)
+        self.object_index = SceneIndex(self._down_to_table(self.object_points))
         scene = _moved(T_base_camera, observation.scene_points)
         scene = scene[self.table.height_m(scene) > self.config.table_noise_m]
         scene = scene[~self.object_index.near(scene, self.config.object_halo_m)]
         own = SceneIndex(self._gripper_points(q_frame))
         self.scene_index = SceneIndex(scene[~own.near(scene, self.config.robot_halo_m)])
+
+    def _down_to_table(self, points: np.ndarray) -> np.ndarray:
+        """Return the object's points and, where the picture cut it off above the table, what must be below them.
+
+        Near the arm the camera sees the upper part only; jaws sent in below it would push what was not seen.
+        """
+        if not len(points):
+            return points
+        height = self.table.height_m(points)
+        lowest = float(np.percentile(height, 1.0))
+        if lowest < self.config.cut_off_m:
+            return points
+        rim = points[height < lowest + _RIM_M]
+        drops = np.arange(0.0, lowest, _DROP_STEP_M)[:, None, None]
+        return np.concatenate([points, (rim - drops * self.table.normal).reshape(-1, 3)])
 
     def check_grippers(
         self,

@@ -54,9 +54,9 @@ class BeakConfig:
     """How far before the asked contacts an object that reaches deep into the hand may be held instead [m]."""
     palm_clearance_m: float = 0.005
     """Free space between the palm and the object [m]."""
-    stator_clearance_m: float = 0.003
+    stator_clearance_m: float = 0.005
     """Gap between the fixed jaw and the object while approaching [m]."""
-    opening_clearance_m: float = 0.012
+    opening_clearance_m: float = 0.014
     """Gap between the moving jaw and the object while approaching; opening wider makes tilted objects collide [m]."""
     friction: float = 0.4
     """Least friction coefficient that must keep the object from being squeezed out; rubber on plastic has 0.5 to 1."""

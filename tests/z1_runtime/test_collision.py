@@ -157,3 +157,13 @@ def test_the_robot_s_own_gripper_in_the_picture_is_no_obstacle(kinematics):
     observation = make_observation(T_base_camera, points, jaw_points)
     checker = CollisionChecker(kinematics, observation, Q_START)
     assert len(checker.scene_index) == 0
+
+
+def test_an_object_cut_off_by_the_picture_s_edge_goes_on_down_to_the_table(kinematics):
+    T_base_camera = camera_pose(kinematics)
+    points = cylinder(0.48, 0.0, T_base_camera[:3, 3])
+    upper = CollisionChecker(kinematics, make_observation(T_base_camera, points[points[:, 2] > 0.10]), Q_START)
+    below_the_cut = np.array([[0.45, 0.0, 0.04]])
+    assert upper.object_index.near(below_the_cut, 0.003).all()
+    whole = CollisionChecker(kinematics, make_observation(T_base_camera, points), Q_START)
+    assert len(whole.object_index) == len(points)

@@ -171,8 +171,11 @@ def test_no_candidates_and_a_spent_budget_are_said_plainly(kinematics, planner):
     with pytest.raises(NoPlanError, match="none of 0 candidates"):
         planner.plan(nothing, observation, Q_START)
     far = in_camera(observation.T_base_camera, [frontal(0.9, 0.0, HEIGHT_M / 2, 0.4)] * 5)
-    with pytest.raises(NoPlanError, match=r"2 ik, 3 not tried"):
-        GraspPlanner(kinematics, PlannerConfig(max_tried=2)).plan(far, observation, Q_START)
+    with pytest.raises(NoPlanError, match=r"none of 5 candidates can be executed: 5 ik"):
+        planner.plan(far, observation, Q_START)
+    walled = scene(kinematics, 0.56, 0.0, wall(0.37, 0.0, height=0.45))
+    with pytest.raises(NoPlanError, match=r"not tried, the search budget \(max_tried\) was spent"):
+        GraspPlanner(kinematics, PlannerConfig(max_tried=1)).plan(candidates(walled, 0.56, 0.0), walled, Q_START)
 
 
 def test_a_configuration_that_makes_no_sense_is_refused():
