@@ -17,18 +17,19 @@ import numpy as np
 from hal import playback
 from hal.arm import Arm
 from hal.clock import Clock
-from hal.errors import CommandRefusedError, HalError, NotConnectedError, StoppedError
+from hal.errors import CommandRefusedError, HalError, HalTimeoutError, NotConnectedError, StoppedError
 from hal.lease import Lease
 from hal.limits import OverloadWatch, ServoLimits, clip_setpoint, find_blocked
 from hal.messages import ArmSetpoint, ArmState, ServoMode, ServoStatus, TrajectoryChunk
 from hal.motion import Motion, Wish
 from hal.periods import PeriodStatistics
 from hal.servo_thread import ServoThread  # noqa: F401  (the servo and its driver are imported from one place)
-from hal.z1 import CONTROL_PERIOD_S, JOINT_NAMES, N_ARM
+from hal.z1 import JOINT_NAMES, N_ARM
 
 log = logging.getLogger(__name__)
 
 _WARN_EVERY_S = 1.0
+_STATE_MAX_AGE_S = 0.2
 
 
 class _Snapshot(NamedTuple):
@@ -87,6 +88,7 @@ class Servo:
         self._beyond = 0
         # Written by the tick.
         self._snapshot: _Snapshot | None = None
+        self._ticked = False
         self._clips = 0
         # Read and written by whoever asks for the status.
         self._clips_told = 0
@@ -124,7 +126,7 @@ class Servo:
         self._motion = Motion(self.limits, state.q)
         self._overload = OverloadWatch(self.limits)
         self._state, self._q_sent = state, state.q
-        self._link_lost = self._give_way = False
+        self._link_lost = self._give_way = self._ticked = False
         self._publish(self.clock.now_s())
 
     def _connected(self) -> _Snapshot:
@@ -136,16 +138,24 @@ class Servo:
     # --- What anybody may call, from any thread ---------------------------------------------------------------
 
     def read_state(self) -> ArmState:
-        """Return the measurement of the last tick; when nothing ticks, ask the arm.
+        """Return the measurement of the last tick; before the first tick, ask the arm.
+
+        Once something ticks, the arm belongs to that thread: a second one would drive it at the same time.
 
         Raises:
             NotConnectedError: before `connect()`.
             HalTimeoutError: the newest measurement is too old to be trusted.
         """
         snapshot = self._connected()
-        if self.clock.now_s() - snapshot.state.stamp_s <= 2.5 * CONTROL_PERIOD_S:
-            return snapshot.state
-        return self.arm.read_state()
+        if not self._ticked:
+            return self.arm.read_state()
+        age_s = self.clock.now_s() - snapshot.state.stamp_s
+        if age_s > _STATE_MAX_AGE_S:
+            raise HalTimeoutError(
+                f"the servo's newest measurement is {age_s:.2f} s old; allowed is {_STATE_MAX_AGE_S} s. "
+                f"Its ticks have ended or the arm is silent: look at the log."
+            )
+        return snapshot.state
 
     def claim(self, owner: str) -> None:
         """Take the command lease (see `hal.arm.ServoedArm.claim`)."""
@@ -317,6 +327,7 @@ class Servo:
             NotConnectedError: before `connect()`.
         """
         self._connected()
+        self._ticked = True
         now_s = self.clock.now_s()
         self.periods.record(now_s)
         self._measure()

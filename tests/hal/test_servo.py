@@ -587,3 +587,16 @@ def test_clipping_is_told_once_a_second(caplog: pytest.LogCaptureFixture) -> Non
         bench.run(2.5, lambda: bench.servo.send(setpoint(beyond)) and None)
     assert 2 <= len(caplog.records) <= 3
     assert "clipped" in caplog.text
+
+
+def test_an_arm_that_is_ticked_is_asked_by_the_tick_alone() -> None:
+    bench = Bench()
+    bench.run(0.1)
+    reads: list[float] = []
+    bench.arm.read_state = lambda: reads.append(1.0)  # type: ignore[method-assign, assignment]
+    bench.clock.advance(0.1)
+    assert bench.servo.read_state().q == pytest.approx(START)
+    bench.clock.advance(0.2)
+    with pytest.raises(HalTimeoutError, match=r"0\.30 s old; allowed is 0\.2 s"):
+        bench.servo.read_state()
+    assert reads == []
