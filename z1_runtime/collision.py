@@ -37,7 +37,7 @@ class CollisionConfig:
 
     scene_threshold_m: float = 0.002
     """A scene point nearer than this to the gripper's surface is hit (the paper's 2 mm) [m]."""
-    object_threshold_m: float = 0.001
+    object_threshold_m: float = 0.002
     """The same for the object's own points while the opened jaws go around it [m]."""
     transfer_threshold_m: float = 0.005
     """The same for scene and object while the arm goes to the pre-grasp [m]."""

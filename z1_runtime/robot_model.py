@@ -51,7 +51,8 @@ _CAMERA_HIGH = np.array([0.030, 0.021, 0.0037])
 # Our mount: a 30 mm wide plate from the wrist's shell to the camera's back
 _BRACKET_FOOT = np.array([0.030, 0.0325, 0.0])
 _BRACKET_HALF_WIDTH_M = 0.015
-_SPACING_M = 0.0075
+_SPACING_M = 0.0085
+_JAW_SPACING_M = 0.005  # jaws pass the object within millimetres, and its edges must not slip between two points
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,18 +70,20 @@ class GripperShape:
 
 @cache
 def gripper_shape(spacing_m: float = _SPACING_M) -> GripperShape:
-    """Return the points, sampled from the STL meshes about `spacing_m` apart [m]."""
+    """Return the points, sampled from the STL meshes about `spacing_m` apart [m], closer on the jaws."""
     T_pivot_flange = np.linalg.inv(z1.T_FLANGE_PIVOT)
     T_pivot_stator = np.eye(4)
     T_pivot_stator[0, 3] = -0.049  # URDF: the mover's joint on the stator
     stator = _moved(T_pivot_stator, _mesh_surface("z1_GripperStator", spacing_m))
+    jaw = _moved(T_pivot_stator, _mesh_surface("z1_GripperStator", _JAW_SPACING_M))
+    stator = np.concatenate([stator[stator[:, 0] < PALM_RADIUS_M], jaw[jaw[:, 0] >= PALM_RADIUS_M]])
     # The housing is hollow; nothing gets inside without crossing what surrounds it
     inside = (np.hypot(stator[:, 0], stator[:, 2]) < PALM_RADIUS_M - 0.002) & (np.abs(stator[:, 1]) < 0.026)
     wrist = _moved(T_pivot_flange, _mesh_surface("z1_Link06", spacing_m))
     camera = _moved(T_pivot_flange @ z1.T_FLANGE_CAMERA, _box_surface(_CAMERA_LOW, _CAMERA_HIGH, spacing_m))
     bracket = _moved(T_pivot_flange, _bracket(spacing_m))
     fixed = np.concatenate([stator[~inside], wrist, camera, bracket])
-    mover = _mesh_surface("z1_GripperMover", spacing_m)
+    mover = _mesh_surface("z1_GripperMover", _JAW_SPACING_M)
     shape = GripperShape(fixed=spread_first(fixed), mover=spread_first(mover))
     shape.fixed.setflags(write=False)
     shape.mover.setflags(write=False)
