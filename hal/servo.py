@@ -1,49 +1,31 @@
 """The 500 Hz servo above any arm: plays trajectories, enforces limits, brakes, holds, and latches the stop.
 
-Threads: one thread (or the lock-step clock) calls `tick`; any thread may call the rest. The tick takes no lock. What
-others hand it are single attributes holding immutable objects (`_playback`, `_target`, `_latch`, `_done_id`), which
-Python replaces atomically; `_lock` only keeps the producers apart. What the tick tells others is one immutable
-snapshot a tick. A stop therefore takes effect at the next tick whatever else is going on.
+Threads: one thread (or the lock-step clock) calls `tick`; any thread may call the rest. The tick takes no lock: what
+producers ask for waits in `hal.orders.Orders`, what the tick tells them is one immutable snapshot a tick.
 """
 
 from __future__ import annotations
 
 import logging
-from threading import Lock
-from typing import NamedTuple
 
 import numpy as np
 
-from hal import playback
 from hal.arm import Arm
 from hal.clock import Clock
-from hal.errors import CommandRefusedError, HalError, HalTimeoutError, NotConnectedError, StoppedError
-from hal.lease import Lease
+from hal.errors import CommandRefusedError, HalError, HalTimeoutError, NotConnectedError
 from hal.limits import OverloadWatch, ServoLimits, clip_setpoint, find_blocked
 from hal.messages import ArmSetpoint, ArmState, ServoMode, ServoStatus, TrajectoryChunk
 from hal.motion import Motion, Wish
+from hal.orders import Orders, Snapshot
 from hal.periods import PeriodStatistics
+from hal.playback import Playback
 from hal.servo_thread import ServoThread  # noqa: F401  (the servo and its driver are imported from one place)
-from hal.z1 import JOINT_NAMES, N_ARM
+from hal.z1 import N_ARM
 
 log = logging.getLogger(__name__)
 
 _WARN_EVERY_S = 1.0
 _STATE_MAX_AGE_S = 0.2
-
-
-class _Snapshot(NamedTuple):
-    """What the tick publishes; replaced as a whole."""
-
-    stamp_s: float
-    mode: ServoMode
-    reason: str
-    trajectory_id: int
-    time_s: float
-    finished: bool
-    q_sent: np.ndarray
-    q_wanted: np.ndarray
-    state: ArmState
 
 
 class Servo:
@@ -76,18 +58,9 @@ class Servo:
         self.periods = PeriodStatistics()
         self._heartbeat_timeout_s = heartbeat_timeout_s
         self._send_timeout_s = send_timeout_s
-        self._lease = Lease(None if heartbeat_timeout_s is None else lease_timeout_s)
-        self._lock = Lock()
-        # Written by producers, read by the tick.
-        self._playback: playback.Playback | None = None
-        self._target: tuple[ArmSetpoint, float] | None = None
-        self._latch = ""
-        self._done_id = 0
-        self._cancel_reason = ""
-        self._rearmed = False
-        self._beyond = 0
+        self._orders = Orders(self.limits, None if heartbeat_timeout_s is None else lease_timeout_s)
         # Written by the tick.
-        self._snapshot: _Snapshot | None = None
+        self._snapshot: Snapshot | None = None
         self._ticked = False
         self._clips = 0
         # Read and written by whoever asks for the status.
@@ -110,16 +83,13 @@ class Servo:
         except HalError:
             self.arm.disconnect()
             raise
-        with self._lock:
-            self._playback = self._target = None
-            self._latch, self._cancel_reason, self._rearmed, self._done_id = "", "", False, 0
-            self._lease.clear()
+        self._orders.reset()
         self._reset(state)
 
     def disconnect(self) -> None:
         """Let go of the arm, which holds where it is. Brake first (`stop`) if it moves; end a `ServoThread` first."""
         self._snapshot = None
-        self._lease.clear()
+        self._orders.lease.clear()
         self.arm.disconnect()
 
     def _reset(self, state: ArmState) -> None:
@@ -129,7 +99,7 @@ class Servo:
         self._link_lost = self._give_way = self._ticked = False
         self._publish(self.clock.now_s())
 
-    def _connected(self) -> _Snapshot:
+    def _connected(self) -> Snapshot:
         snapshot = self._snapshot
         if snapshot is None:
             raise NotConnectedError("the servo")
@@ -159,17 +129,11 @@ class Servo:
 
     def claim(self, owner: str) -> None:
         """Take the command lease (see `hal.arm.ServoedArm.claim`)."""
-        snapshot = self._connected()
-        with self._lock:
-            at_rest = snapshot.mode in (ServoMode.HOLDING, ServoMode.STOPPED)
-            self._lease.claim(owner, self.clock.now_s(), at_rest=at_rest)
+        self._orders.claim(owner, self.clock.now_s(), at_rest=self._connected().at_rest)
 
     def release(self, owner: str | None = None) -> None:
         """Give the lease back; a running motion is braked first. Harmless when not held (by `owner`)."""
-        with self._lock:
-            if self._lease.owner and owner in (None, self._lease.owner):
-                self._cancel(f"{self._lease.owner!r} released the arm in motion")
-                self._lease.clear()
+        self._orders.release(owner)
 
     def heartbeat(self, owner: str | None = None) -> None:
         """Say that the lease's owner is alive.
@@ -177,14 +141,11 @@ class Servo:
         Raises:
             LeaseError: `owner` does not hold the lease.
         """
-        with self._lock:
-            self._lease.beat(owner, self.clock.now_s())
+        self._orders.beat(owner, self.clock.now_s())
 
     def stop(self, reason: str = "stop requested") -> None:
         """Brake at the next tick, then hold; every command is refused until `rearm()`. Queued motion is dropped."""
-        with self._lock:
-            self._latch = self._latch or reason
-            self._cancel(reason)
+        self._orders.stop(reason)
 
     def fail(self, reason: str) -> None:
         """Latch and stop the arm itself: for a driver whose tick cannot go on."""
@@ -197,11 +158,7 @@ class Servo:
     def rearm(self) -> None:
         """Lift a latched stop; the arm holds where it is and the lease is free. No effect when not stopped."""
         self._connected()
-        with self._lock:
-            if self._latch:
-                self._latch = ""
-                self._lease.clear()
-                self._rearmed = True
+        self._orders.rearm()
 
     def stream(self, chunk: TrajectoryChunk, owner: str | None = None) -> None:
         """Queue a piece of a trajectory (see `hal.arm.ServoedArm.stream`).
@@ -216,22 +173,7 @@ class Servo:
         snapshot = self._connected()
         if not isinstance(chunk, TrajectoryChunk):
             raise CommandRefusedError(f"stream() takes a TrajectoryChunk, not a {type(chunk).__name__}.")
-        with self._lock:
-            self._admit(owner)
-            old = self._playback
-            newest = max(self._done_id, old.trajectory_id if old else 0)
-            running = old is not None and old.trajectory_id > self._done_id
-            if running and old is not None and chunk.trajectory_id == old.trajectory_id:
-                played_s = snapshot.time_s if snapshot.trajectory_id == old.trajectory_id else 0.0
-                self._playback = playback.extend(old, chunk, played_s, self.limits)
-                return
-            if chunk.trajectory_id <= newest:
-                raise CommandRefusedError(
-                    f"trajectory {chunk.trajectory_id} is over ({snapshot.reason or 'played or replaced'}); "
-                    f"the next one is {newest + 1} or more."
-                )
-            self._check_start(chunk, snapshot)
-            self._playback = playback.begin(chunk, self.limits)
+        self._orders.stream(chunk, owner, self.clock.now_s(), snapshot)
 
     def send(self, setpoint: ArmSetpoint, owner: str | None = None) -> ArmSetpoint:
         """Move towards one setpoint within all limits; return it clipped to the joints' limits and a tick's reach.
@@ -246,13 +188,7 @@ class Servo:
         snapshot = self._connected()
         if not isinstance(setpoint, ArmSetpoint):
             raise CommandRefusedError(f"send() takes an ArmSetpoint, not a {type(setpoint).__name__}.")
-        with self._lock:
-            self._admit(owner)
-            old = self._playback
-            if old is not None and old.trajectory_id > self._done_id:
-                raise CommandRefusedError(f"trajectory {old.trajectory_id} is playing; let it end or release() it.")
-            self._target = (setpoint, self.clock.now_s())
-            self._beyond += bool(((setpoint.q < self.limits.q_min) | (setpoint.q > self.limits.q_max)).any())
+        self._orders.send(setpoint, owner, self.clock.now_s())
         allowed = clip_setpoint(self.limits, setpoint.q, setpoint.dq, snapshot.q_sent, snapshot.state.q)
         return ArmSetpoint(q=allowed.q, dq=allowed.dq)
 
@@ -262,16 +198,16 @@ class Servo:
         now_s = self.clock.now_s()
         self._tell_clips(now_s)
         p50, p999 = self.periods.summary_ms()
-        current = self._playback
+        current = self._orders.current
         buffered_s = 0.0
-        if current is not None and current.trajectory_id > self._done_id:
+        if current is not None:
             played_s = snapshot.time_s if current.trajectory_id == snapshot.trajectory_id else 0.0
             buffered_s = max(current.end_s - played_s, 0.0)
         return ServoStatus(
             stamp_s=snapshot.stamp_s,
             mode=snapshot.mode,
             reason=snapshot.reason,
-            owner=self._lease.holder(now_s, at_rest=snapshot.mode in (ServoMode.HOLDING, ServoMode.STOPPED)),
+            owner=self._orders.lease.holder(now_s, at_rest=snapshot.at_rest),
             trajectory_id=snapshot.trajectory_id,
             trajectory_time_s=snapshot.time_s,
             buffered_s=buffered_s,
@@ -283,35 +219,8 @@ class Servo:
             period_ms_p999=p999,
         )
 
-    # --- Producers' helpers, under the lock -----------------------------------------------------------------------
-
-    def _admit(self, owner: str | None) -> None:
-        if self._latch:
-            raise StoppedError(self._latch)
-        self._lease.beat(owner, self.clock.now_s())
-
-    def _cancel(self, reason: str) -> None:
-        self._cancel_reason = reason
-        self._target = None
-        if self._playback is not None:
-            self._done_id = max(self._done_id, self._playback.trajectory_id)
-
-    def _check_start(self, chunk: TrajectoryChunk, snapshot: _Snapshot) -> None:
-        # A squeezing gripper's command leads its measurement, so there the command counts, before or after limits.
-        commanded = np.abs(chunk.q[0] - snapshot.q_wanted)
-        other = np.abs(chunk.q[0] - snapshot.state.q)
-        other[N_ARM] = abs(chunk.q[0, N_ARM] - snapshot.q_sent[N_ARM])
-        error = np.minimum(commanded, other)
-        if error.max() > self.limits.start_error_rad:
-            worst = int(error.argmax())
-            raise CommandRefusedError(
-                f"trajectory {chunk.trajectory_id} starts {error[worst]:.3f} rad from {JOINT_NAMES[worst]} (it is at "
-                f"{snapshot.state.q[worst]:.3f} rad, commanded {snapshot.q_wanted[worst]:.3f}); allowed is "
-                f"{self.limits.start_error_rad} rad. Plan again from the present pose."
-            )
-
     def _tell_clips(self, now_s: float) -> None:
-        clips = self._clips + self._beyond
+        clips = self._clips + self._orders.beyond
         if clips != self._clips_told and now_s - self._told_s >= _WARN_EVERY_S:
             log.warning("servo: %d setpoints were clipped to the limits.", clips - self._clips_told)
             self._clips_told, self._told_s = clips, now_s
@@ -349,63 +258,62 @@ class Servo:
         blocked = overload or find_blocked(self.limits, self._q_sent, state.q)
         if blocked:
             # Holding the command would go on pushing: once at rest, the arm holds what it measures instead.
-            self._give_way = self._give_way or not self._latch
+            self._give_way = self._give_way or not self._orders.latch
             self._fault(blocked)
 
     def _fault(self, reason: str) -> None:
         """Latch, as `stop` does: somebody has to look at the arm before it moves again."""
-        if not self._latch:
-            self._cancel_reason = reason
-            self._latch = reason
+        orders = self._orders
+        if not orders.latch:
+            orders.cancel_reason = reason
+            orders.latch = reason
 
     def _choose(self, now_s: float) -> Wish:
-        motion = self._motion
-        if self._rearmed:
-            self._rearmed = self._link_lost = False
+        motion, orders = self._motion, self._orders
+        if orders.rearmed:
+            orders.rearmed = self._link_lost = False
             self._give_way, motion.reason = True, ""
-        if self._done_id > motion.trajectory_id:
-            motion.skip(self._done_id, self._cancel_reason)
-        current, target = self._playback, self._target
-        if self._latch:
-            self._finish(current)
-            self._target = None
+        if orders.done_id > motion.trajectory_id:
+            motion.skip(orders.done_id, orders.cancel_reason)
+        # Read once: a producer may replace any of them while this runs.
+        newest, current, target = orders.playback, orders.current, orders.target
+        if orders.latch:
+            orders.finish(newest)
+            orders.target = None
             if motion.mode is ServoMode.TRACKING:
-                motion.brake(self._latch)
-        elif current is not None and current.trajectory_id > self._done_id:
+                motion.brake(orders.latch)
+        elif current is not None:
             return self._follow(current, now_s)
-        elif target is not None and now_s - target[1] <= self._send_timeout_s:
-            return motion.chase(target[0].q)
+        elif target is not None and now_s - target.stamp_s <= self._send_timeout_s:
+            return motion.chase(target.setpoint.q)
         elif motion.mode is ServoMode.TRACKING:
-            motion.brake("" if target else self._cancel_reason)
-            self._target = None
+            motion.brake("" if target else orders.cancel_reason)
+            orders.target = None
         if self._give_way and motion.mode is ServoMode.HOLDING:
             self._give_way = False
             motion.give_way(self._state.q)
         return motion.rest()
 
-    def _follow(self, current: playback.Playback, now_s: float) -> Wish:
+    def _follow(self, current: Playback, now_s: float) -> Wish:
         motion = self._motion
         if current.trajectory_id != motion.trajectory_id:
             motion.begin(current)
         late = self._lateness(now_s)
         if late or motion.runs_dry(current):
-            self._finish(current)
+            self._orders.finish(current)
             motion.brake(late or f"trajectory {current.trajectory_id} ran dry at {current.end_s:.3f} s")
             return motion.rest()
         wish = motion.play(current)
         if motion.finished:
-            self._finish(current)
+            self._orders.finish(current)
         return wish
 
-    def _finish(self, current: playback.Playback | None) -> None:
-        if current is not None:
-            self._done_id = max(self._done_id, current.trajectory_id)
-
     def _lateness(self, now_s: float) -> str:
-        silent_s = now_s - self._lease.beat_s
-        if self._heartbeat_timeout_s is None or silent_s <= self._heartbeat_timeout_s:
+        lease, allowed_s = self._orders.lease, self._heartbeat_timeout_s
+        silent_s = now_s - lease.beat_s
+        if allowed_s is None or silent_s <= allowed_s:
             return ""
-        return f"no heartbeat from {self._lease.owner!r} for {silent_s:.3f} s (allowed {self._heartbeat_timeout_s} s)"
+        return f"no heartbeat from {lease.owner!r} for {silent_s:.3f} s (allowed {allowed_s} s)"
 
     def _command(self, q: np.ndarray, dq: np.ndarray) -> None:
         allowed = clip_setpoint(self.limits, q, dq, self._q_sent, self._state.q)
@@ -423,11 +331,11 @@ class Servo:
 
     def _publish(self, now_s: float) -> None:
         motion = self._motion
-        stopped = bool(self._latch) and motion.mode is not ServoMode.BRAKING
-        self._snapshot = _Snapshot(
+        stopped = bool(self._orders.latch) and motion.mode is not ServoMode.BRAKING
+        self._snapshot = Snapshot(
             stamp_s=now_s,
             mode=ServoMode.STOPPED if stopped else motion.mode,
-            reason=self._latch or motion.reason,
+            reason=self._orders.latch or motion.reason,
             trajectory_id=motion.trajectory_id,
             time_s=max(motion.time_s, 0.0),
             finished=motion.finished,

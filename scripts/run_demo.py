@@ -169,7 +169,7 @@ def _phase_printer(console: Console) -> Callable[[Phase], None]:
 
 def _print_result(console: Console, config: Config, summary: dict[str, Any]) -> None:
     stages = ", ".join(f"{name} {ms:.0f}" for name, ms in summary["stage_ms"].items())
-    console.print(f"  frame in, plan out [ms]: {stages}")
+    console.print(f"  frame in, plan out (ms): {stages}", soft_wrap=True)
     verdict = "[bold green]lifted[/]" if summary["success"] else "[bold red]not lifted[/]"
     console.print(
         f"{verdict}: the {config.object} is {1e3 * summary['lifted_m']:.0f} mm up; see {config.out}/grasp.png"

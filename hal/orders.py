@@ -1,0 +1,172 @@
+"""What producers ask of the servo: the lease, the queue of trajectory pieces, single setpoints, the latched stop.
+
+Any thread calls the methods, which take `_lock` to keep the producers apart. The tick takes no lock: it reads and
+replaces whole attributes holding immutable objects (`playback`, `target`, `latch`, `done_id`), which Python does
+atomically. A stop therefore takes effect at the next tick whatever else is going on.
+"""
+
+from __future__ import annotations
+
+from threading import Lock
+from typing import NamedTuple
+
+import numpy as np
+
+from hal import playback
+from hal.errors import CommandRefusedError, StoppedError
+from hal.lease import Lease
+from hal.limits import ServoLimits
+from hal.messages import ArmSetpoint, ArmState, ServoMode, TrajectoryChunk
+from hal.z1 import JOINT_NAMES, N_ARM
+
+
+class Snapshot(NamedTuple):
+    """What the tick tells everybody; replaced as a whole."""
+
+    stamp_s: float
+    mode: ServoMode
+    reason: str
+    trajectory_id: int
+    time_s: float
+    finished: bool
+    q_sent: np.ndarray
+    q_wanted: np.ndarray
+    state: ArmState
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether nothing moves."""
+        return self.mode in (ServoMode.HOLDING, ServoMode.STOPPED)
+
+
+class Target(NamedTuple):
+    """A single setpoint to move towards."""
+
+    setpoint: ArmSetpoint
+    stamp_s: float
+
+
+class Orders:
+    """The producers' side of a servo.
+
+    Args:
+        limits: what trajectories are checked against.
+        lease_timeout_s: see `hal.lease.Lease`.
+    """
+
+    def __init__(self, limits: ServoLimits, lease_timeout_s: float | None) -> None:
+        self._limits = limits
+        self._lock = Lock()
+        self.lease = Lease(lease_timeout_s)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything: no lease, no motion, no latched stop."""
+        with self._lock:
+            self.playback: playback.Playback | None = None
+            self.target: Target | None = None
+            self.latch = ""
+            """Why the servo is stopped; empty when it is not."""
+            self.done_id = 0
+            """Trajectories up to this one are over."""
+            self.cancel_reason = ""
+            """Why the last one was cut short by a producer."""
+            self.rearmed = False
+            """Set by `rearm`, taken by the tick."""
+            self.beyond = 0
+            """How many single setpoints lay outside the joint limits."""
+            self.lease.clear()
+
+    @property
+    def current(self) -> playback.Playback | None:
+        """The trajectory that is to be played; None when none is."""
+        newest = self.playback
+        return newest if newest is not None and newest.trajectory_id > self.done_id else None
+
+    def finish(self, trajectory: playback.Playback | None) -> None:
+        """Call `trajectory` over, and all before it."""
+        if trajectory is not None:
+            self.done_id = max(self.done_id, trajectory.trajectory_id)
+
+    def claim(self, owner: str, now_s: float, *, at_rest: bool) -> None:
+        """Take the lease (errors as `Lease.claim`)."""
+        with self._lock:
+            self.lease.claim(owner, now_s, at_rest=at_rest)
+
+    def release(self, owner: str | None) -> None:
+        """Give the lease back, if `owner` (None = whoever) holds it, and cancel the motion."""
+        with self._lock:
+            if self.lease.owner and owner in (None, self.lease.owner):
+                self._cancel(f"{self.lease.owner!r} released the arm in motion")
+                self.lease.clear()
+
+    def beat(self, owner: str | None, now_s: float) -> None:
+        """Note that the owner lives (errors as `Lease.beat`)."""
+        with self._lock:
+            self.lease.beat(owner, now_s)
+
+    def stop(self, reason: str) -> None:
+        """Latch the stop and drop what is queued."""
+        with self._lock:
+            self.latch = self.latch or reason
+            self._cancel(reason)
+
+    def rearm(self) -> None:
+        """Lift a latched stop and free the lease."""
+        with self._lock:
+            if self.latch:
+                self.latch = ""
+                self.lease.clear()
+                self.rearmed = True
+
+    def stream(self, chunk: TrajectoryChunk, owner: str | None, now_s: float, snapshot: Snapshot) -> None:
+        """Queue `chunk` (errors as `hal.servo.Servo.stream`)."""
+        with self._lock:
+            self._admit(owner, now_s)
+            running = self.current
+            if running is not None and chunk.trajectory_id == running.trajectory_id:
+                played_s = snapshot.time_s if snapshot.trajectory_id == running.trajectory_id else 0.0
+                self.playback = playback.extend(running, chunk, played_s, self._limits)
+                return
+            newest = max(self.done_id, self.playback.trajectory_id if self.playback else 0)
+            if chunk.trajectory_id <= newest:
+                raise CommandRefusedError(
+                    f"trajectory {chunk.trajectory_id} is over ({snapshot.reason or 'played or replaced'}); "
+                    f"the next one is {newest + 1} or more."
+                )
+            self._check_start(chunk, snapshot)
+            self.playback = playback.begin(chunk, self._limits)
+
+    def send(self, setpoint: ArmSetpoint, owner: str | None, now_s: float) -> None:
+        """Make `setpoint` the target (errors as `hal.servo.Servo.send`)."""
+        with self._lock:
+            self._admit(owner, now_s)
+            running = self.current
+            if running is not None:
+                raise CommandRefusedError(f"trajectory {running.trajectory_id} is playing; let it end or release() it.")
+            self.target = Target(setpoint, now_s)
+            self.beyond += bool(((setpoint.q < self._limits.q_min) | (setpoint.q > self._limits.q_max)).any())
+
+    def _admit(self, owner: str | None, now_s: float) -> None:
+        if self.latch:
+            raise StoppedError(self.latch)
+        self.lease.beat(owner, now_s)
+
+    def _cancel(self, reason: str) -> None:
+        self.cancel_reason = reason
+        self.target = None
+        self.finish(self.playback)
+
+    def _check_start(self, chunk: TrajectoryChunk, snapshot: Snapshot) -> None:
+        # A squeezing gripper's command leads its measurement, so there the command counts, before or after limits.
+        commanded = np.abs(chunk.q[0] - snapshot.q_wanted)
+        other = np.abs(chunk.q[0] - snapshot.state.q)
+        other[N_ARM] = abs(chunk.q[0, N_ARM] - snapshot.q_sent[N_ARM])
+        error = np.minimum(commanded, other)
+        if error.max() > self._limits.start_error_rad:
+            worst = int(error.argmax())
+            raise CommandRefusedError(
+                f"trajectory {chunk.trajectory_id} starts {error[worst]:.3f} rad from {JOINT_NAMES[worst]} (it is at "
+                f"{snapshot.state.q[worst]:.3f} rad, commanded {snapshot.q_wanted[worst]:.3f}); allowed is "
+                f"{self._limits.start_error_rad} rad. Plan again from the present pose."
+            )
