@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import logging
 import threading
 import uuid
@@ -14,7 +15,7 @@ from hal.bus import keys
 from hal.bus.codec import decode, encode
 from hal.bus.link import Link
 from hal.bus.remote_camera import RemoteCamera as RemoteCamera  # noqa: PLC0414 (a re-export)
-from hal.bus.service import as_bytes
+from hal.bus.service import Listener, as_bytes
 from hal.bus.session import BusConfig
 from hal.clock import Clock, WallClock
 from hal.errors import HalTimeoutError, NotConnectedError
@@ -41,7 +42,8 @@ class RemoteArm:
         self._owner = f"{owner}-{self._suffix}"
         self._clock = clock or WallClock()
         self._link: Link | None = None
-        self._newest: tuple[bytes, float] | None = None
+        self._states: Listener | None = None
+        self._newest = b""
         self._arrived = threading.Event()
         self._heart: _Heart | None = None
 
@@ -56,21 +58,23 @@ class RemoteArm:
         if self._link is not None:
             return
         link = Link(self._config, self._clock, "the remote arm")
-        self._newest = None
         self._arrived.clear()
-        link.session.declare_subscriber(keys.STATE, self._take_state)
+        states = Listener(link.session, keys.STATE, self._take_state)
         if not self._arrived.wait(self._config.connect_timeout_s):
+            states.close()
             link.close()
             raise HalTimeoutError(
                 f"the HAL process at {self._config.endpoint} publishes no arm state; look at its log, then at the arm."
             )
-        self._link = link
+        self._link, self._states = link, states
+        atexit.register(self.disconnect)  # a program that ends carelessly leaves no thread inside Zenoh
 
     def disconnect(self) -> None:
         """Give the lease back, if it is ours, and close the link. Harmless when not connected."""
-        link = self._link
-        if link is None:
+        link, states = self._link, self._states
+        if link is None or states is None:
             return
+        atexit.unregister(self.disconnect)
         try:
             if self._heart is not None:
                 self.release()
@@ -78,7 +82,8 @@ class RemoteArm:
             pass  # there is nobody left to give it back to, and without our heartbeat it lapses
         finally:
             self._stop_heart()
-            self._link = None
+            self._link = self._states = None
+            states.close()
             link.close()
 
     def __enter__(self) -> Self:
@@ -93,16 +98,16 @@ class RemoteArm:
     # --- Arm ------------------------------------------------------------------------------------------------------
 
     def read_state(self) -> ArmState:
-        """Return the newest published measurement (up to 10 ms old; see `hal.arm.Arm.read_state`)."""
-        self._connected()
-        newest = self._newest
-        age_s = self._clock.now_s() - newest[1] if newest else float("inf")
-        if newest is None or age_s > self._config.state_max_age_s:
+        """Return the newest published measurement (about 10 ms old; see `hal.arm.Arm.read_state`)."""
+        link = self._connected()
+        state = decode(self._newest, ArmState)
+        age_s = self._clock.now_s() + link.clock_offset_s - state.stamp_s
+        if age_s > self._config.state_max_age_s:
             raise HalTimeoutError(
                 f"the newest arm state from {self._config.endpoint} is {age_s:.2f} s old; allowed is "
                 f"{self._config.state_max_age_s} s. The HAL process is gone or its arm is silent: look at its log."
             )
-        return decode(newest[0], ArmState)
+        return state
 
     def send(self, setpoint: ArmSetpoint) -> ArmSetpoint:
         """Hand over one setpoint (see `hal.arm.Arm.send`)."""
@@ -167,7 +172,7 @@ class RemoteArm:
         return self._heart.owner if self._heart is not None else self._owner
 
     def _take_state(self, sample: zenoh.Sample) -> None:
-        self._newest = (as_bytes(sample.payload), self._clock.now_s())
+        self._newest = as_bytes(sample.payload)
         self._arrived.set()
 
     def _stop_heart(self) -> None:

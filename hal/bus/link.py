@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import atexit
 import threading
 
 import zenoh
@@ -42,8 +41,6 @@ class Link:
         before = existing_segments()
         self.session = open_session(config, listen=False)
         self._segments = mapped_segments() - before
-        # With a session left open Zenoh hangs at exit.
-        atexit.register(self.close)
         try:
             self.hello, self.clock_offset_s = self._greet()
         except HalError:
@@ -57,6 +54,7 @@ class Link:
             HalTimeoutError: no answer.
             HalError: whatever the service raised, as the same class.
         """
+        asked_s = self._clock.now_s()
         try:
             replies = list(self._querier(key).get(payload=payload, attachment=owner.encode()))
         except zenoh.ZError as err:
@@ -66,18 +64,23 @@ class Link:
                 return reply.ok.payload.to_bytes()
             text = as_bytes(reply.err.payload) if reply.err is not None else b""
             if text == b"Timeout":  # Zenoh's own
-                raise HalTimeoutError(
-                    f"{key}: the HAL process at {self._config.endpoint} gave no answer within "
-                    f"{self._config.request_timeout_s} s; look at its log."
-                )
+                raise self._no_answer(key)
             raise decode_error(text)
+        # Nothing at once: nobody was asked. Nothing after the timeout: the other end of Zenoh gave up before this one.
+        if self._clock.now_s() - asked_s > 0.5 * self._config.request_timeout_s:
+            raise self._no_answer(key)
         raise nobody_answers(self._config)
 
     def close(self) -> None:
         """End the session."""
-        atexit.unregister(self.close)
         self.session.close()
         unlink_segments(self._segments)
+
+    def _no_answer(self, key: str) -> HalTimeoutError:
+        return HalTimeoutError(
+            f"{key}: the HAL process at {self._config.endpoint} gave no answer within "
+            f"{self._config.request_timeout_s} s; look at its log."
+        )
 
     def _querier(self, key: str) -> zenoh.Querier:
         with self._lock:

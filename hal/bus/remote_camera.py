@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import logging
 import threading
 from collections import deque
@@ -15,7 +16,7 @@ from hal.bus import keys
 from hal.bus.codec import decode
 from hal.bus.frames import FrameStamp
 from hal.bus.link import Link
-from hal.bus.service import as_bytes
+from hal.bus.service import Listener, as_bytes
 from hal.bus.session import BusConfig
 from hal.clock import Clock, WallClock
 from hal.errors import HalTimeoutError, InvalidMessageError, NotConnectedError
@@ -23,12 +24,17 @@ from hal.messages import Intrinsics, RgbdFrame
 
 _LOG = logging.getLogger(__name__)
 _LATENCIES_KEPT = 1000
+_LINGER_S = 0.5
+"""How long it listens on after the last call that waited, so that calls in a row do not begin anew each time."""
+_FRAMES_WAITING = 2
 
 
 class RemoteCamera:
     """The camera of a HAL process (`hal.camera.Camera`).
 
-    Holds the newest frame only, still packed; it is unpacked in the thread of whoever waits for it.
+    Holds the newest frame only, still packed; it is unpacked in the thread of whoever waits for it. It listens only
+    while somebody waits: a frame nobody looks at is neither sent nor, in the twin, drawn. Any number of threads may
+    wait at once.
 
     Args:
         config: where the HAL process is.
@@ -41,6 +47,10 @@ class RemoteCamera:
         self._link: Link | None = None
         self._intrinsics: Intrinsics | None = None
         self._news = threading.Condition()
+        # Below, all under `_news`.
+        self._listener: Listener | None = None
+        self._waiting = 0
+        self._wanted_s = 0.0
         self._newest: tuple[FrameStamp, zenoh.ZBytes] | None = None
         self._last_sequence: int | None = None
         self._latencies_ms: deque[float] = deque(maxlen=_LATENCIES_KEPT)
@@ -57,11 +67,10 @@ class RemoteCamera:
         """
         if self._link is not None:
             return
-        self._newest = self._last_sequence = None
         self.lost_frames = 0
-        self._link = link = Link(self._config, self._clock, "the remote camera")
+        self._link = Link(self._config, self._clock, "the remote camera")
+        atexit.register(self.disconnect)  # a program that ends carelessly leaves no thread inside Zenoh
         try:
-            link.session.declare_subscriber(keys.FRAME, self._take)
             # The first frame is answered by a camera that may have to wake up.
             self._intrinsics = self.wait_for_frame(max(self._config.connect_timeout_s, 1.0)).intrinsics
         except (HalTimeoutError, InvalidMessageError):
@@ -70,12 +79,18 @@ class RemoteCamera:
         self._latencies_ms.clear()
 
     def disconnect(self) -> None:
-        """Close the link. Harmless when not connected."""
-        link, self._link = self._link, None
+        """Close the link; who waits for a frame is told so. Harmless when not connected."""
+        with self._news:
+            link, self._link = self._link, None
+            listener, self._listener = self._listener, None
+            self._newest = None
+            self._news.notify_all()
         if link is None:
             return
+        atexit.unregister(self.disconnect)
+        if listener is not None:
+            listener.close()
         link.close()
-        self._newest = None
 
     def __enter__(self) -> Self:
         self.connect()
@@ -100,7 +115,8 @@ class RemoteCamera:
 
     def frame_latency_ms(self, percentile: float) -> float:
         """Return a percentile of `frame_latencies_ms` [ms]; 0 before the first."""
-        return float(np.percentile(self._latencies_ms, percentile)) if self._latencies_ms else 0.0
+        latencies_ms = self.frame_latencies_ms
+        return float(np.percentile(latencies_ms, percentile)) if latencies_ms else 0.0
 
     def wait_for_frame(self, timeout_s: float) -> RgbdFrame:
         """Return the next frame exposed after this call began (see `hal.camera.Camera.wait_for_frame`).
@@ -108,24 +124,38 @@ class RemoteCamera:
         Raises:
             InvalidMessageError: a frame came that cannot be read.
         """
-        link = self._link
-        if link is None:
-            raise NotConnectedError("the remote camera")
         began_s = self._clock.now_s()
-        while True:
-            stamp, payload = self._wait_newer(began_s, timeout_s, link.clock_offset_s)
-            frame = self._unpack(payload)
-            if frame is not None:
-                self._latencies_ms.append(1e3 * (self._clock.now_s() + link.clock_offset_s - stamp.sent_s))
-                return frame
+        with self._news:
+            link = self._connected()
+            self._waiting += 1
+            if self._listener is None:
+                self._last_sequence = None
+                self._listener = Listener(link.session, keys.FRAME, self._take, waiting=_FRAMES_WAITING)
+        try:
+            while True:
+                stamp, payload = self._wait_newer(link, began_s, timeout_s)
+                frame = self._unpack(stamp, payload)
+                if frame is not None:
+                    self._latencies_ms.append(1e3 * (self._clock.now_s() + link.clock_offset_s - stamp.sent_s))
+                    return frame
+        finally:
+            with self._news:
+                self._waiting -= 1
+                self._wanted_s = self._clock.now_s()
 
-    def _wait_newer(self, began_s: float, timeout_s: float, offset_s: float) -> tuple[FrameStamp, zenoh.ZBytes]:
+    def _connected(self) -> Link:
+        if self._link is None:
+            raise NotConnectedError("the remote camera")
+        return self._link
+
+    def _wait_newer(self, link: Link, began_s: float, timeout_s: float) -> tuple[FrameStamp, zenoh.ZBytes]:
         give_up_s = began_s + timeout_s
         with self._news:
             while True:
-                newest, self._newest = self._newest, None
-                if newest is not None and newest[0].exposed_s >= began_s + offset_s:
-                    return newest
+                if self._link is not link:
+                    raise NotConnectedError("the remote camera")
+                if self._newest is not None and self._newest[0].exposed_s >= began_s + link.clock_offset_s:
+                    return self._newest
                 left_s = give_up_s - self._clock.now_s()
                 if left_s <= 0:
                     raise HalTimeoutError(
@@ -134,12 +164,15 @@ class RemoteCamera:
                     )
                 self._news.wait(left_s)
 
-    def _unpack(self, payload: zenoh.ZBytes) -> RgbdFrame | None:
+    def _unpack(self, stamp: FrameStamp, payload: zenoh.ZBytes) -> RgbdFrame | None:
         shared = payload.as_shm()
         data = payload.to_bytes()
         # Shared memory is taken back from a reader that stood still for too long: then what was copied may be torn.
         if shared is not None and not shared.is_valid():
             _LOG.warning("a frame was overwritten while it was read; waiting for the next.")
+            with self._news:
+                if self._newest is not None and self._newest[0] is stamp:
+                    self._newest = None
             return None
         self.shared_memory = shared is not None
         return decode(data, RgbdFrame)
@@ -151,6 +184,12 @@ class RemoteCamera:
             _LOG.warning("a frame was dropped: %s", error)
             return
         with self._news:
+            if self._listener is None:  # disconnected
+                return
+            if not self._waiting and self._clock.now_s() - self._wanted_s > _LINGER_S:
+                self._listener.close()
+                self._listener = self._newest = None
+                return
             if self._last_sequence is not None and stamp.sequence > self._last_sequence + 1:
                 self.lost_frames += stamp.sequence - self._last_sequence - 1
             self._last_sequence = stamp.sequence

@@ -14,7 +14,7 @@ What goes which way, and why:
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from importlib.metadata import version
 from threading import Event
 from typing import Protocol
@@ -25,7 +25,7 @@ from hal.arm import ServoedArm
 from hal.bus import keys
 from hal.bus.codec import VERSION, Hello, decode, decode_text, encode
 from hal.bus.frames import FrameBuffers, FrameStamp, existing_segments, mapped_segments, unlink_segments
-from hal.bus.service import Answer, GuardedThread, Service, as_bytes, received
+from hal.bus.service import Answer, GuardedThread, Listener, Service, as_bytes
 from hal.bus.session import BusConfig, open_session
 from hal.camera import Camera
 from hal.clock import Clock
@@ -73,7 +73,6 @@ class HalServer:
         self._closing = Event()
         self.failed = Event()
         """Set when a thread of the server died; the process should then stop the arm and end."""
-        self._somebody_watches = Event()
         before = existing_segments()
         self._buffers = FrameBuffers(camera.intrinsics, shared=config.shared_memory)
         try:
@@ -83,6 +82,7 @@ class HalServer:
             raise
         self._segments = mapped_segments() - before
         self._threads: list[GuardedThread] = []
+        self._deaf = _Complaint("a heartbeat is not taken")
         self._start_publishing()
         self._services = [
             Service(self._session, key, answer, self.failed.set, heed_anyone=key == keys.STOP)
@@ -105,10 +105,10 @@ class HalServer:
         if self._closing.is_set():
             return
         self._closing.set()
-        self._somebody_watches.set()
         for service in self._services:
             service.close()
-        self._heartbeats.undeclare()
+        self._heartbeats.close()
+        self._watchers.undeclare()
         for thread in self._threads:
             thread.join()
         self._session.close()
@@ -127,12 +127,17 @@ class HalServer:
         self._frames = session.declare_publisher(
             keys.FRAME, priority=zenoh.Priority.DATA_LOW, congestion_control=zenoh.CongestionControl.DROP
         )
-        self._watchers = self._frames.declare_matching_listener(self._note_watchers)
-        self._heartbeats = session.declare_subscriber(keys.HEARTBEAT, zenoh.handlers.RingChannel(_HEARTBEATS_WAITING))
+        self._watchers = self._frames.declare_matching_listener(zenoh.handlers.RingChannel(1))
+        self._heartbeats = Listener(
+            session,
+            keys.HEARTBEAT,
+            self._take_heartbeat,
+            waiting=_HEARTBEATS_WAITING,
+            on_death=self.failed.set,
+        )
         loops: dict[str, Callable[[], None]] = {
             "bus state": self._publish_state,
             "bus frames": self._publish_frames,
-            "bus heartbeat": self._take_heartbeats,
         }
         for name, loop in loops.items():
             self._threads.append(GuardedThread(name, loop, self.failed.set))
@@ -155,17 +160,23 @@ class HalServer:
             due_s = max(due_s + period_s, self._clock.now_s())
             self._clock.sleep_until(due_s)
 
-    def _note_watchers(self, status: zenoh.MatchingStatus) -> None:
-        if status.matching:
-            self._somebody_watches.set()
-        elif not self._closing.is_set():
-            self._somebody_watches.clear()
+    def _watched(self) -> Iterator[None]:
+        """Yield again and again while somebody listens to frames; wait while nobody does; end at `close()`."""
+        changes = self._watchers.handler
+        # Who kept its session through a restart of this process listens already.
+        watched = self._frames.matching_status.matching  # pyright: ignore[reportAttributeAccessIssue] (its stub is wrong)
+        while not self._closing.is_set():
+            try:
+                change = changes.try_recv() if watched else changes.recv()
+            except zenoh.ZError:  # closed
+                return
+            watched = watched if change is None else change.matching
+            if watched:
+                yield
 
     def _publish_frames(self) -> None:
         complaint = _Complaint("no frames are published")
-        while not self._closing.is_set():
-            if not self._somebody_watches.wait(_IDLE_S):
-                continue
+        for _ in self._watched():
             try:
                 frame = self._camera.wait_for_frame(_FRAME_TIMEOUT_S)
                 payload = self._buffers.fill(frame)
@@ -179,16 +190,14 @@ class HalServer:
 
     # --- What is taken --------------------------------------------------------------------------------------------
 
-    def _take_heartbeats(self) -> None:
-        complaint = _Complaint("a heartbeat is not taken")
-        for sample in received(self._heartbeats.handler):
-            try:
-                self._servo.heartbeat(decode_text(as_bytes(sample.payload), "the heartbeat") or "nobody")
-                complaint.over()
-            except LeaseError:
-                pass  # a client that has just lost the lease is told so at its next command
-            except HalError as error:
-                complaint.say(error)
+    def _take_heartbeat(self, sample: zenoh.Sample) -> None:
+        try:
+            self._servo.heartbeat(decode_text(as_bytes(sample.payload), "the heartbeat") or "nobody")
+            self._deaf.over()
+        except LeaseError:
+            pass  # a client that has just lost the lease is told so at its next command
+        except HalError as error:
+            self._deaf.say(error)
 
     def _answers(self) -> list[tuple[str, Answer]]:
         servo = self._servo

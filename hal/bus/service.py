@@ -1,10 +1,14 @@
-"""One acked query of the HAL, answered on its own thread, so that no service ever waits for another."""
+"""Threads that receive: one for each acked query, so that no service ever waits for another, one for each topic.
+
+Zenoh's own callbacks are not used: they run on threads that are not daemons, for which a program that ends with its
+session still open would wait for ever.
+"""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator
-from threading import Thread
+from threading import Thread, current_thread
 from typing import Any
 
 import zenoh
@@ -51,6 +55,46 @@ class GuardedThread(Thread):
         finally:
             if not ended:
                 self._on_death()
+
+
+class Listener:
+    """A subscriber and the thread that takes its samples.
+
+    Args:
+        session: open Zenoh session.
+        key: what is listened to.
+        take: called with each sample.
+        waiting: how many samples may wait; beyond that the oldest are dropped.
+        on_death: called when the thread dies of an unexpected error.
+    """
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        key: str,
+        take: Callable[[zenoh.Sample], None],
+        *,
+        waiting: int = 1,
+        on_death: Callable[[], None] = lambda: None,
+    ) -> None:
+        self._take = take
+        self._closing = False
+        self._subscriber = session.declare_subscriber(key, zenoh.handlers.RingChannel(waiting))
+        self._thread = GuardedThread(f"bus {key}", self._run, on_death)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Listen no more; waits for the sample in hand, except when called by `take` itself."""
+        self._closing = True
+        self._subscriber.undeclare()
+        if self._thread is not current_thread():
+            self._thread.join()
+
+    def _run(self) -> None:
+        for sample in received(self._subscriber.handler):
+            if self._closing:  # what was still waiting
+                return
+            self._take(sample)
 
 
 class Service:
@@ -100,7 +144,7 @@ class Service:
             refusal = encode_error(error)
             self._send(lambda: query.reply_err(refusal))
         else:
-            self._send(lambda: query.reply(self._key, reply, priority=zenoh.Priority.REAL_TIME, express=True))
+            self._send(lambda: query.reply(self._key, reply, express=True))
 
     def _asker(self, query: zenoh.Query) -> str:
         try:

@@ -70,7 +70,7 @@ def _same(a: object, b: object) -> bool:
 
 
 def _envelope(header: object, body: bytes = b"") -> bytes:
-    packed = msgpack.packb(header)
+    packed = bytes(msgpack.packb(header) or b"")
     return b"Z1\x01\x00" + len(packed).to_bytes(4, "little") + packed + body
 
 

@@ -66,7 +66,11 @@ def test_a_status_asked_for_after_a_chunk_tells_of_that_chunk(remote_arm):
     remote_arm.claim()
     for trajectory_id in (1, 2):
         chunk = TrajectoryChunk(
-            trajectory_id=trajectory_id, t_s=[0.0, 0.1], q=[HOME, HOME], dq=np.zeros((2, 7)), final=True
+            trajectory_id=trajectory_id,
+            t_s=np.array([0.0, 0.1]),
+            q=np.array([HOME, HOME]),
+            dq=np.zeros((2, 7)),
+            final=True,
         )
         remote_arm.stream(chunk)
         wait_until(lambda i=trajectory_id: remote_arm.status().trajectory_id == i and remote_arm.status().finished)
@@ -121,7 +125,7 @@ def test_refusals_cross_the_link_as_their_own_classes(remote_arm):
     with pytest.raises(LeaseError):
         remote_arm.stream(slow_motion())
     remote_arm.claim()
-    far = TrajectoryChunk(trajectory_id=1, t_s=[0.0, 1.0], q=np.full((2, 7), -0.5), dq=np.zeros((2, 7)))
+    far = TrajectoryChunk(trajectory_id=1, t_s=np.array([0.0, 1.0]), q=np.full((2, 7), -0.5), dq=np.zeros((2, 7)))
     with pytest.raises(CommandRefusedError, match="starts"):
         remote_arm.stream(far)
     remote_arm.stop("enough")
@@ -147,7 +151,9 @@ def test_a_stop_from_a_second_client_holds_until_rearmed(hal, remote_arm):
         bystander.rearm()
     remote_arm.claim()
     q = hal.servo.status().q_command
-    remote_arm.stream(TrajectoryChunk(trajectory_id=2, t_s=[0.0, 0.1], q=[q, q], dq=np.zeros((2, 7)), final=True))
+    remote_arm.stream(
+        TrajectoryChunk(trajectory_id=2, t_s=np.array([0.0, 0.1]), q=np.array([q, q]), dq=np.zeros((2, 7)), final=True)
+    )
     wait_until(lambda: remote_arm.status().finished)
 
 
@@ -235,8 +241,7 @@ def test_frames_arrive_pixel_by_pixel_through_shared_memory_and_without(hal):
         config = BusConfig(port=hal.config.port, shared_memory=shared)
         with RemoteCamera(config) as camera:
             frame = camera.wait_for_frame(2.0)
-            if not shared:
-                assert not camera.shared_memory
+            assert camera.shared_memory is shared
             np.testing.assert_array_equal(frame.colour, originals[frame.sequence].colour)
             np.testing.assert_array_equal(frame.depth_m, originals[frame.sequence].depth_m)
 
@@ -250,15 +255,69 @@ def test_the_camera_is_only_read_while_somebody_listens(hal):
         assert reads == []
     with RemoteCamera(hal.config) as camera:
         camera.wait_for_frame(2.0)
-    assert reads
+        assert reads
+        wait_until(lambda: _pauses(reads))
+        # ... and begins again for the next who waits.
+        count = len(reads)
+        camera.wait_for_frame(2.0)
+        assert len(reads) > count
+
+
+def _pauses(reads: list) -> bool:
+    count = len(reads)
+    Event().wait(0.3)
+    return len(reads) == count
+
+
+def test_threads_that_wait_at_once_all_get_the_next_frame(hal, remote_camera):
+    # The camera gives one frame and no other: whoever is handed it must not take it from the rest.
+    take, waiting = hal.camera.wait_for_frame, Event()
+    wait_until(lambda: remote_camera._listener is None)
+
+    def one(timeout_s):
+        waiting.wait()
+        hal.camera.wait_for_frame = lambda _: _silence()
+        return take(timeout_s)
+
+    hal.camera.wait_for_frame = one
+    frames: list[int] = []
+    threads = [Thread(target=lambda: frames.append(remote_camera.wait_for_frame(5.0).sequence)) for _ in range(3)]
+    for thread in threads:
+        thread.start()
+    wait_until(lambda: remote_camera._waiting == len(threads))
+    waiting.set()
+    for thread in threads:
+        thread.join()
+    assert len(frames) == 3
+    assert len(set(frames)) == 1
+
+
+def test_who_waits_for_a_frame_when_the_camera_is_disconnected_is_told_so(hal, remote_camera):
+    wait_until(lambda: remote_camera._listener is None)
+    hal.camera.wait_for_frame = lambda timeout_s: _silence()
+    errors: list[Exception] = []
+
+    def wait() -> None:
+        try:
+            remote_camera.wait_for_frame(60.0)
+        except NotConnectedError as error:
+            errors.append(error)
+
+    thread = Thread(target=wait)
+    thread.start()
+    wait_until(lambda: remote_camera._waiting)
+    remote_camera.disconnect()
+    thread.join()
+    assert errors
+
+
+def _silence():
+    Event().wait(0.05)
+    raise HalTimeoutError("the cable is out")
 
 
 def test_a_camera_that_falls_silent_is_a_timeout(hal, remote_camera):
-    def silence(timeout_s):
-        Event().wait(0.05)
-        raise HalTimeoutError("the cable is out")
-
-    hal.camera.wait_for_frame = silence
+    hal.camera.wait_for_frame = lambda timeout_s: _silence()
     Event().wait(0.1)
     with pytest.raises(HalTimeoutError, match="no new frame"):
         remote_camera.wait_for_frame(0.3)
@@ -267,7 +326,7 @@ def test_a_camera_that_falls_silent_is_a_timeout(hal, remote_camera):
 def test_a_gap_in_the_sequence_is_counted(hal, remote_camera):
     take = hal.camera.wait_for_frame
     hal.camera.wait_for_frame = lambda timeout_s: (take(timeout_s), take(timeout_s), take(timeout_s))[2]
-    wait_until(lambda: remote_camera.lost_frames >= 2)
+    wait_until(lambda: remote_camera.wait_for_frame(2.0) and remote_camera.lost_frames >= 2)
 
 
 def test_without_room_in_shared_memory_frames_go_as_bytes_with_one_warning(hal, monkeypatch, caplog):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -43,10 +44,13 @@ arm.connect()
 camera.connect()
 arm.claim()
 camera.wait_for_frame(5.0)
+print("through shared memory" if camera.shared_memory else "as bytes", flush=True)
+sys.stdin.readline()
 if sys.argv[2] == "tidy":
     arm.disconnect()
     camera.disconnect()
-print("seen")
+if sys.argv[2] == "failing":
+    raise SystemError("on purpose")
 """
 SERVE = """
 import sys
@@ -65,10 +69,19 @@ def _start(code: str, *arguments: object) -> subprocess.Popen:
     return subprocess.Popen(
         [sys.executable, "-c", code, *map(str, arguments)],
         cwd=ROOT,
+        stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
         text=True,
         env={**os.environ, "PYTHONPATH": str(ROOT)},
     )
+
+
+def _end(*processes: subprocess.Popen | None) -> None:
+    for process in processes:
+        if process is not None:
+            process.kill()
+            process.communicate()
 
 
 @pytest.fixture
@@ -98,8 +111,7 @@ def test_a_killed_runtime_leaves_an_arm_that_brakes_and_holds(hal, recorded):
         wait_until(lambda: moving(hal.servo), 30.0)
         killed_s = WallClock().now_s()
     finally:
-        runtime.kill()
-        runtime.wait()
+        _end(runtime)
     wait_until(lambda: hal.servo.status().mode is ServoMode.HOLDING)
     status = hal.servo.status()
     assert "heartbeat" in status.reason
@@ -120,19 +132,40 @@ def test_a_stop_from_another_process_holds_a_moving_arm_until_rearmed(hal, recor
             assert _last_motion_s(recorded) <= stopped_s + BRAKED_WITHIN_S
             assert runtime.poll() is None
     finally:
-        runtime.kill()
-        runtime.wait()
+        _end(runtime)
 
 
-@pytest.mark.parametrize("manners", ["tidy"])
-def test_a_client_ends_without_hanging_and_leaves_no_shared_memory(hal, manners):
-    before = set(Path("/dev/shm").glob("*.zenoh"))
-    client = _start(LOOK, hal.config.port, manners)
-    output, _ = client.communicate(timeout=60)
-    assert output == "seen\n"
-    assert client.returncode == 0
-    if manners == "tidy":
-        assert set(Path("/dev/shm").glob("*.zenoh")) <= before
+def _shared_memory_of(process: subprocess.Popen) -> set[Path]:
+    """Return the shared-memory files of Zenoh that a process has mapped."""
+    names = re.findall(r"/dev/shm/\S+\.zenoh", Path(f"/proc/{process.pid}/maps").read_text())
+    return {Path(name) for name in names}
+
+
+@pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="reads Linux's memory maps")
+@pytest.mark.parametrize(
+    ("manners", "number"), [("tidy", signal.SIGTERM), ("careless", signal.SIGINT), ("failing", signal.SIGTERM)]
+)
+def test_frames_cross_in_shared_memory_of_which_nothing_is_left_once_both_processes_have_ended(manners, number):
+    config = free_config()
+    server = _start(SERVE, config.port)
+    client = None
+    try:
+        assert server.stdout is not None
+        assert server.stdout.readline() == "ready\n"
+        client = _start(LOOK, config.port, manners)
+        assert client.stdout is not None
+        assert client.stdout.readline() == "through shared memory\n"
+        mapped = _shared_memory_of(server) | _shared_memory_of(client)
+        assert any(path.exists() for path in mapped)
+        _, errors = client.communicate("\n", timeout=60)  # a client that hangs at its end fails here
+        assert client.returncode == (1 if manners == "failing" else 0)
+        assert ("on purpose" in errors) == (manners == "failing")
+        server.send_signal(number)
+        server.communicate(timeout=60)
+        assert server.returncode == 0
+        assert [path for path in mapped if path.exists()] == []
+    finally:
+        _end(server, client)
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
@@ -157,8 +190,4 @@ def test_a_hal_process_told_to_end_in_motion_brakes_first(number):
         assert np.abs(last.dq).max() < 0.01
         assert 0.0 < last.q[0] < 0.5, "the motion of 0.6 rad was cut short"
     finally:
-        process.kill()
-        process.wait()
-        if runtime is not None:
-            runtime.kill()
-            runtime.wait()
+        _end(process, runtime)
