@@ -6,6 +6,7 @@ To add one, append to `ARM_CASES` or `CAMERA_CASES`: a name and a context manage
 
 from __future__ import annotations
 
+import socket
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
@@ -15,10 +16,14 @@ from typing import Any
 import numpy as np
 
 from hal.arm import Arm
+from hal.bus.client import RemoteArm, RemoteCamera
+from hal.bus.server import HalServer
+from hal.bus.session import BusConfig
 from hal.camera import Camera
-from hal.clock import Clock, ManualClock
+from hal.clock import Clock, ManualClock, WallClock
 from hal.registry import ARMS, CAMERAS
-from hal.servo import Servo
+from hal.rig import RIGS
+from hal.servo import Servo, ServoThread
 
 
 @dataclass(frozen=True)
@@ -106,12 +111,51 @@ def registered_camera(name: str) -> Iterator[CameraCase]:
     camera.disconnect()
 
 
+@contextmanager
+def running_hal() -> Iterator[BusConfig]:
+    """Serve the mock rig on a free port, by the wall clock."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        config = BusConfig(port=probe.getsockname()[1])
+    rig = RIGS.make("mock")
+    servo = Servo(rig.arm, rig.clock, heartbeat_timeout_s=0.1)
+    servo.connect()
+    rig.camera.connect()
+    with ServoThread(servo, rig.clock), HalServer(servo, rig.camera, rig.clock, config):
+        yield config
+    servo.disconnect()
+    rig.camera.disconnect()
+
+
+@contextmanager
+def remote_arm() -> Iterator[ArmCase]:
+    with running_hal() as config:
+        arm = RemoteArm(config, owner="conformance")
+
+        def revive() -> None:
+            arm.rearm()
+            arm.claim()
+
+        yield ArmCase(arm, WallClock(), arm.claim, revive)
+        arm.disconnect()
+
+
+@contextmanager
+def remote_camera() -> Iterator[CameraCase]:
+    with running_hal() as config:
+        camera = RemoteCamera(config)
+        yield CameraCase(camera, WallClock())
+        camera.disconnect()
+
+
 ARM_CASES: list[tuple[str, Callable[[], AbstractContextManager[ArmCase]]]] = [
     *((name, partial(registered_arm, name)) for name in ARMS.names()),
     *((f"servo over {name}", partial(servoed_arm, name)) for name in ARMS.names()),
+    ("remote", remote_arm),
 ]
 CAMERA_CASES: list[tuple[str, Callable[[], AbstractContextManager[CameraCase]]]] = [
     *((name, partial(registered_camera, name)) for name in CAMERAS.names()),
+    ("remote", remote_camera),
 ]
 
 
