@@ -24,17 +24,15 @@ from hal.messages import Intrinsics, RgbdFrame
 
 _LOG = logging.getLogger(__name__)
 _LATENCIES_KEPT = 1000
-_LINGER_S = 0.5
-"""How long it listens on after the last call that waited, so that calls in a row do not begin anew each time."""
 _FRAMES_WAITING = 2
 
 
 class RemoteCamera:
     """The camera of a HAL process (`hal.camera.Camera`).
 
-    Holds the newest frame only, still packed; it is unpacked in the thread of whoever waits for it. It listens only
-    while somebody waits: a frame nobody looks at is neither sent nor, in the twin, drawn. Any number of threads may
-    wait at once.
+    Holds the newest frame only, still packed; it is unpacked in the thread of whoever waits for it. Any number of
+    threads may wait at once. It listens from the first call that waits to the first frame that nobody waits for: what
+    nobody looks at is neither sent nor, in the twin, drawn.
 
     Args:
         config: where the HAL process is.
@@ -50,7 +48,6 @@ class RemoteCamera:
         # Below, all under `_news`.
         self._listener: Listener | None = None
         self._waiting = 0
-        self._wanted_s = 0.0
         self._newest: tuple[FrameStamp, zenoh.ZBytes] | None = None
         self._last_sequence: int | None = None
         self._latencies_ms: deque[float] = deque(maxlen=_LATENCIES_KEPT)
@@ -141,7 +138,6 @@ class RemoteCamera:
         finally:
             with self._news:
                 self._waiting -= 1
-                self._wanted_s = self._clock.now_s()
 
     def _connected(self) -> Link:
         if self._link is None:
@@ -186,7 +182,7 @@ class RemoteCamera:
         with self._news:
             if self._listener is None:  # disconnected
                 return
-            if not self._waiting and self._clock.now_s() - self._wanted_s > _LINGER_S:
+            if not self._waiting:
                 self._listener.close()
                 self._listener = self._newest = None
                 return

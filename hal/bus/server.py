@@ -5,7 +5,7 @@ What goes which way, and why:
 * State and status: put at 100 Hz, REAL_TIME, DROP, express. The newest replaces the one before.
 * Heartbeat: the same, from the owner. Losing one is harmless, five in a row make the servo brake.
 * Trajectory chunks: acked queries, not puts. A lost chunk would be noticed only by the arm running dry, and a refused
-  one not at all; an answer costs 0.3 ms every 0.1 s.
+  one not at all; an answer costs about 1 ms every 0.1 s.
 * Stop, re-arm, claim, release, send, status: acked queries, each on a thread of its own, so that a stop waits for
   nobody. Stop and re-arm need no lease: whoever sees the arm may stop it.
 * Frames: put, DATA_LOW, DROP, in shared memory, only while somebody listens.
