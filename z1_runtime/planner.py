@@ -51,8 +51,6 @@ class PlannerConfig:
     """Tried where the arm cannot draw back that far [m]."""
     lift_m: float = 0.10
     """Straight up after closing [m]."""
-    squeeze_rad: float = 0.12
-    """How far past contact the closing jaw is commanded; the servo's stiffness turns it into torque [rad]."""
     fallback_width_m: float = 0.06
     """Taken where neither the generator nor the cloud tells a width [m]."""
     max_tried: int = 60
@@ -91,8 +89,6 @@ class _Way:
     T_base_grasp: np.ndarray
     """(4, 4)."""
     jaw_open: float
-    """[rad]"""
-    jaw_close: float
     """[rad]"""
 
 
@@ -209,8 +205,9 @@ class GraspPlanner:
         T_lifted = _shifted(way.T_base_pivot, np.array([0.0, 0.0, self.config.lift_m]))
         try:
             approach = straight_move(self._kinematics, T_pre, way.T_base_pivot, q_pre, way.jaw_open, limits)
-            close = gripper_move(approach.q[-1], way.jaw_close, limits)
-            lift = straight_move(self._kinematics, way.T_base_pivot, T_lifted, close.q[-1], way.jaw_close, limits)
+            # The servo bounds the torque, so "closed" is where the jaws are sent, not where they end.
+            close = gripper_move(approach.q[-1], z1.GRIPPER_CLOSED, limits)
+            lift = straight_move(self._kinematics, way.T_base_pivot, T_lifted, close.q[-1], z1.GRIPPER_CLOSED, limits)
         except PathFailure as failure:
             raise _Refused("path", str(failure)) from failure
         _refuse(
@@ -279,7 +276,6 @@ class _Fitted:
                 reason="width", detail=self._gripper.refusal(float(self.widths_m[rank]), float(self._fronts_m[rank]))
             )
         T_base_grasp = self._T_base_grasps[rank]
-        jaw_close = min(float(batch.jaw_contact[n]) + self._config.squeeze_rad, z1.GRIPPER_CLOSED)
         # The pivot's +y carries the camera: above the hand it is clear of the table and sees the object
         camera_up_first = (0, 1) if T_base_grasp[2, 0] >= 0.0 else (1, 0)
         free = [flip for flip in camera_up_first if problems[n][flip] is None]
@@ -292,7 +288,6 @@ class _Fitted:
                 T_base_pivot=batch.T_base_pivots[n, flip],
                 T_base_grasp=T_base_grasp,
                 jaw_open=float(batch.jaw_open[n]),
-                jaw_close=jaw_close,
             )
             for flip in free
         ]
