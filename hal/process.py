@@ -16,6 +16,7 @@ from hal.messages import ServoMode
 from hal.rig import Rig
 from hal.servo import Servo
 from hal.servo_thread import ServoThread
+from hal.z1 import CONTROL_PERIOD_S
 
 _LOG = logging.getLogger(__name__)
 HEARTBEAT_TIMEOUT_S = 0.15
@@ -64,6 +65,7 @@ def serve(
         undo.callback(rig.camera.disconnect)
         ticking.start()
         undo.callback(ticking.stop)
+        _await_first_tick(servo, ticking)
         server = undo.enter_context(HalServer(servo, rig.camera, rig.clock, config))
         undo.callback(_come_to_rest, servo, ticking)
         _LOG.info("serving robot %s at %s", config.robot, config.endpoint)
@@ -72,6 +74,13 @@ def serve(
         while not stop_event.wait(_LOOK_S) and ticking.alive:
             if server.failed.is_set():
                 raise HalError("a thread of the link's server died; its traceback is above. The arm is being stopped.")
+
+
+def _await_first_tick(servo: Servo, ticking: ServoThread) -> None:
+    """From then on the arm is asked by the servo's thread alone, however many ask the servo."""
+    pause = Event()
+    while ticking.alive and not servo.status().ticks:
+        pause.wait(CONTROL_PERIOD_S)
 
 
 def _come_to_rest(servo: Servo, ticking: ServoThread) -> None:
