@@ -115,10 +115,9 @@ class HalProcess:
         assert self._process.stdout is not None
         if self._process.stdout.readline().decode().strip() != READY:
             self._process.wait()
-            lines = self._log.read_text(errors="replace").strip().splitlines() or ["it said nothing"]
-            raise HalError(
-                f"the HAL process ended at its start: {lines[-1].removeprefix('error: ')} (log: {self._log})"
-            )
+            lines = self._log.read_text(errors="replace").splitlines()
+            errors = [line.removeprefix("error: ") for line in lines if line.startswith("error: ")]
+            raise HalError(errors[-1] if errors else f"the HAL process ended at its start; see {self._log}")
 
     def end(self) -> None:
         """Let the HAL brake and end."""

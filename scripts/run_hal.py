@@ -9,7 +9,7 @@ Stop it with Ctrl-C: it brakes, holds, and lets go.
 from __future__ import annotations
 
 import logging
-import sys
+import os
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from threading import Event, Thread
@@ -49,7 +49,9 @@ class Config:
 
 def main(config: Config) -> int:
     """Serve until told to stop."""
-    logging.basicConfig(level=logging.INFO, format="hal: %(message)s")
+    logging.basicConfig(level=logging.WARNING, format="hal: %(message)s")
+    for room in ("hal", "sim_twin"):
+        logging.getLogger(room).setLevel(logging.INFO)
     rig = make_rig(config)
     stop_event = Event()
     stop_on_signals(stop_event)
@@ -95,5 +97,6 @@ def make_rig(config: Config) -> Rig:
 
 
 def _watch_stdin(stop_event: Event) -> None:
-    sys.stdin.buffer.read()
+    while os.read(0, 4096):  # not sys.stdin: its lock, held by a daemon thread, aborts the interpreter's exit
+        pass
     stop_event.set()
