@@ -19,7 +19,7 @@ _PATIENCE_S = 1.0
 
 
 class FrameTap:
-    """Hands every frame it can get to the inspector, with the camera's pose at that moment.
+    """Hands frames to the inspector, with the camera's pose at that moment; few, since each costs the HAL a picture.
 
     For devices that live by the wall clock; in lock-step, waiting for a frame would move time.
 
@@ -28,16 +28,24 @@ class FrameTap:
         arm: connected.
         inspector: gets the frames.
         T_flange_camera: (4, 4) hand-eye transform.
+        rate_hz: most frames a second.
     """
 
     def __init__(
-        self, camera: Camera, arm: Arm, inspector: Inspector, T_flange_camera: np.ndarray = z1.T_FLANGE_CAMERA
+        self,
+        camera: Camera,
+        arm: Arm,
+        inspector: Inspector,
+        T_flange_camera: np.ndarray = z1.T_FLANGE_CAMERA,
+        *,
+        rate_hz: float = 4.0,
     ) -> None:
         self._camera = camera
         self._arm = arm
         self._inspector = inspector
         self._T_flange_camera = T_flange_camera
         self._kinematics = Kinematics()
+        self._period_s = 1.0 / rate_hz
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="frame tap", daemon=True)
 
@@ -50,7 +58,7 @@ class FrameTap:
         self._thread.join()
 
     def _run(self) -> None:
-        while not self._closing.is_set():
+        while not self._closing.wait(self._period_s):
             try:
                 frame = self._camera.wait_for_frame(_PATIENCE_S)
                 q = self._arm.read_state().q[: z1.N_ARM]
