@@ -1,0 +1,199 @@
+"""The two networks: a denoiser of grasps and a judge of them, both looking at the cloud from each grasp's own frame."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+POSITION_SCALE_M = 0.05
+CLOUD_SCALE_M = 0.06
+WIDTH_MEAN_M, WIDTH_SCALE_M = 0.055, 0.03
+N_COORDINATES = 10
+_N_TOKENS = 48
+_N_RELATIVE = 24
+_QUERY, _VALUE = 16, 24  # channels of an attention head
+
+
+def encode_grasps(T: Tensor, widths_m: Tensor) -> Tensor:
+    """Return grasps (…, 4, 4) and widths (…) as coordinates (…, 10): position, approach, closing, width, all near 1."""
+    width = (widths_m[..., None] - WIDTH_MEAN_M) / WIDTH_SCALE_M
+    return torch.cat([T[..., :3, 3] / POSITION_SCALE_M, T[..., :3, 2], T[..., :3, 1], width], dim=-1)
+
+
+def decode_grasps(v: Tensor) -> tuple[Tensor, Tensor]:
+    """Return poses (…, 4, 4) and widths (…) [m] of coordinates (…, 10), their axes made square to each other."""
+    T = torch.zeros(*v.shape[:-1], 4, 4, dtype=v.dtype)
+    T[..., :3, :3] = decode_rotations(v)
+    T[..., :3, 3] = v[..., :3] * POSITION_SCALE_M
+    T[..., 3, 3] = 1.0
+    return T, v[..., 9] * WIDTH_SCALE_M + WIDTH_MEAN_M
+
+
+def decode_rotations(v: Tensor) -> Tensor:
+    """Return the rotations (…, 3, 3) of coordinates (…, 10): columns closing × approach, closing, approach."""
+    z = F.normalize(v[..., 3:6], dim=-1, eps=1e-6)
+    y = v[..., 6:9] - (v[..., 6:9] * z).sum(-1, keepdim=True) * z
+    y = F.normalize(y, dim=-1, eps=1e-6)
+    return torch.stack([torch.linalg.cross(y, z), y, z], dim=-1)
+
+
+def signal_share(t: Tensor) -> Tensor:
+    """Return ᾱ(t), t in [0, 1], of the cosine schedule (Nichol and Dhariwal 2021, eq. 17)."""
+    return torch.cos((t + 0.008) / 1.008 * math.pi / 2.0) ** 2
+
+
+def _fourier(x: Tensor, octaves: int = 4) -> Tensor:
+    phase = (x[..., None] * (2.0 ** torch.arange(octaves, dtype=x.dtype) * math.pi / 2.0)).flatten(-2)
+    return torch.cat([x, phase.sin(), phase.cos()], dim=-1)
+
+
+def _mlp(*sizes: int) -> nn.Sequential:
+    layers: list[nn.Module] = []
+    for before, after in zip(sizes[:-1], sizes[1:], strict=True):
+        layers += [nn.Linear(before, after), nn.SiLU()]
+    return nn.Sequential(*layers)
+
+
+class CloudEncoder(nn.Module):
+    """PointNet with one pass of global context; gives a code of the whole cloud and one of each token point."""
+
+    def __init__(self, code: int = 256, token: int = 128) -> None:
+        super().__init__()
+        self.local = _mlp(30, 96, 128)
+        self.context = _mlp(256, 192, 192)
+        self.code = _mlp(384, code, code)
+        self.token = nn.Linear(192, token)
+
+    def forward(self, cloud: Tensor) -> tuple[Tensor, Tensor]:
+        """Return code (B, 256) and tokens (B, 48, 128) of clouds (B, N, 6), points [m] and normals."""
+        x = self.local(torch.cat([_fourier(cloud[..., :3] / CLOUD_SCALE_M), cloud[..., 3:]], dim=-1))
+        whole = x.amax(dim=1, keepdim=True)
+        x = self.context(torch.cat([x, whole.expand_as(x)], dim=-1))
+        code = self.code(torch.cat([x.amax(dim=1), x.mean(dim=1)], dim=-1))
+        return code, self.token(x[:, :_N_TOKENS])
+
+
+class _Block(nn.Module):
+    """Attention from a grasp to the token points, biased by where they lie in its frame; then a modulated MLP."""
+
+    def __init__(self, width: int, condition: int, token: int, heads: int = 4) -> None:
+        super().__init__()
+        self.heads = heads
+        self.norm_query = nn.LayerNorm(width)
+        self.query = nn.Linear(width, heads * _QUERY)
+        self.key = nn.Linear(token, heads * _QUERY)
+        self.value = nn.Linear(token, heads * _VALUE)
+        self.bias = nn.Linear(_N_RELATIVE, heads)
+        self.out = nn.Linear(heads * (_VALUE + _N_RELATIVE), width)
+        self.norm = nn.LayerNorm(width, elementwise_affine=False)
+        self.modulate = nn.Linear(condition, 2 * width)
+        self.mlp = nn.Sequential(nn.Linear(width, 2 * width), nn.SiLU(), nn.Linear(2 * width, width))
+        nn.init.zeros_(self.out.weight)
+
+    def forward(self, x: Tensor, condition: Tensor, tokens: Tensor, relative: Tensor) -> Tensor:
+        """Return x (B, K, width) after looking at tokens (B, M, ·) that lie at `relative` (B, K, M, 24)."""
+        batch, count, _ = x.shape
+        query = self.query(self.norm_query(x)).view(batch, count, self.heads, _QUERY).transpose(1, 2)
+        key = self.key(tokens).view(batch, -1, self.heads, _QUERY).permute(0, 2, 3, 1)
+        value = self.value(tokens).view(batch, -1, self.heads, _VALUE).transpose(1, 2)
+        weights = query @ key / math.sqrt(_QUERY) + self.bias(relative).permute(0, 3, 1, 2)
+        weights = weights.softmax(dim=-1)
+        seen = (weights @ value).transpose(1, 2)  # (B, K, H, 24)
+        felt = weights.transpose(1, 2) @ relative  # (B, K, H, M) @ (B, K, M, 24)
+        x = x + self.out(torch.cat([seen, felt], dim=-1).flatten(2))
+        scale, shift = self.modulate(condition).chunk(2, dim=-1)
+        return x + self.mlp(self.norm(x) * (1.0 + scale) + shift)
+
+
+class GraspHead(nn.Module):
+    """Maps grasps and a cloud to numbers about each grasp."""
+
+    def __init__(self, outputs: int, blocks: int, timed: bool, width: int = 192) -> None:
+        super().__init__()
+        self.enter = nn.Linear(9 * N_COORDINATES, width)
+        self.relative = _mlp(12, 32, _N_RELATIVE)
+        self.time = _mlp(64, 128, 128) if timed else None
+        self.condition = _mlp(256 + (128 if timed else 0), 256)
+        self.blocks = nn.ModuleList([_Block(width, 256, 128) for _ in range(blocks)])
+        self.leave = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, outputs))
+
+    def forward(self, v: Tensor, t: Tensor | None, code: Tensor, tokens: Tensor, cloud: Tensor) -> Tensor:
+        """Return (B, K, outputs) for grasps v (B, K, 10) at times t (B, K or 1) among clouds (B, N, 6)."""
+        relative = self.relative(_seen_from(v, cloud[:, :_N_TOKENS]))
+        condition = code[:, None]
+        if self.time is not None and t is not None:
+            rates = torch.exp(torch.linspace(0.0, math.log(1000.0), 32))
+            phase = t[..., None] * rates
+            time = self.time(torch.cat([phase.sin(), phase.cos()], dim=-1))
+            condition = torch.cat([condition.expand(-1, time.shape[1], -1), time.to(code.dtype)], dim=-1)
+        condition = self.condition(condition)
+        x = self.enter(_fourier(v))
+        for block in self.blocks:
+            x = block(x, condition, tokens, relative)
+        return self.leave(x)
+
+
+def _seen_from(v: Tensor, token_points: Tensor) -> Tensor:
+    """Return where (B, K, M, 12) token points (B, M, 6) and their normals lie in the frames of grasps (B, K, 10)."""
+    batch, count, _ = v.shape
+    R = decode_rotations(v)
+    columns = R.permute(0, 2, 1, 3).reshape(batch, 3, count * 3)
+    m = token_points.shape[1]
+
+    def turned(vectors: Tensor) -> Tensor:
+        return (vectors @ columns).view(batch, m, count, 3).transpose(1, 2)
+
+    origin = (v[:, :, None, :3] @ R)  # (B, K, 1, 3)
+    r = turned(token_points[..., :3] / POSITION_SCALE_M) - origin
+    return torch.cat([r / 2.0, torch.tanh(1.5 * r), torch.tanh(5.0 * r), turned(token_points[..., 3:])], dim=-1)
+
+
+class Denoiser(nn.Module):
+    """The generator: learns v-prediction (Salimans and Ho 2022) and samples by DDIM (Song et al. 2021)."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.encoder = CloudEncoder()
+        self.head = GraspHead(N_COORDINATES, blocks=4, timed=True)
+
+    def loss(self, cloud: Tensor, grasps: Tensor) -> Tensor:
+        """Return the mean squared error of the predicted velocity for grasps (B, K, 10) of clouds (B, N, 6)."""
+        code, tokens = self.encoder(cloud)
+        t = torch.rand(grasps.shape[:2]) * 0.999 + 0.0005
+        share = signal_share(t)[..., None]
+        noise = torch.randn_like(grasps)
+        noisy = share.sqrt() * grasps + (1.0 - share).sqrt() * noise
+        velocity = share.sqrt() * noise - (1.0 - share).sqrt() * grasps
+        return F.mse_loss(self.head(noisy, t, code, tokens, cloud).float(), velocity)
+
+    @torch.inference_mode()
+    def sample(self, cloud: Tensor, noise: Tensor, steps: int) -> Tensor:
+        """Return grasps (B, K, 10) of clouds (B, N, 6), denoised from `noise` (B, K, 10)."""
+        code, tokens = self.encoder(cloud)
+        x = noise
+        times = torch.linspace(0.995, 0.0, steps + 1)
+        for step in range(steps):
+            here = signal_share(times[step])
+            v = self.head(x, times[step].view(1, 1).expand(len(x), 1), code, tokens, cloud).float()
+            clean = (here.sqrt() * x - (1.0 - here).sqrt() * v).clamp(-5.0, 5.0)
+            noise = (1.0 - here).sqrt() * x + here.sqrt() * v
+            there = signal_share(times[step + 1]) if step + 1 < steps else torch.tensor(1.0)
+            x = there.sqrt() * clean + (1.0 - there).sqrt() * noise
+        return x
+
+
+class Discriminator(nn.Module):
+    """Judges grasps: the logit of the chance that one holds."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.encoder = CloudEncoder()
+        self.head = GraspHead(1, blocks=2, timed=False)
+
+    def forward(self, cloud: Tensor, grasps: Tensor) -> Tensor:
+        """Return logits (B, K) for grasps (B, K, 10) among clouds (B, N, 6)."""
+        code, tokens = self.encoder(cloud)
+        return self.head(grasps, None, code, tokens, cloud)[..., 0]

@@ -1,0 +1,108 @@
+"""Grasps by diffusion: the trained networks behind the contract that all generators share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from models.graspgen.cloud import prepare_cloud
+from models.types import GraspSet
+
+_MIN_POINTS = 30
+_LARGEST_OBJECT_M = 1.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DiffusionConfig:
+    """Which weights, and how they are sampled."""
+
+    gripper: str = "agnostic"
+    """The hand the weights were trained for; they lie in `models/weights/graspgen_<gripper>.npz`."""
+    weights: Path | None = None
+    """Another weights file, its checksum beside it."""
+    steps: int = 8
+    """Denoising steps."""
+    temperature: float = 1.0
+    """Spread of the starting noise; below 1 grasps are safer and less varied."""
+    max_width_m: float = 0.136
+    """Widths are given up to this opening [m]."""
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.steps <= 100:
+            raise ValueError(f"steps is {self.steps}; allowed is 1 to 100.")
+        if not 0.0 < self.temperature <= 1.5:
+            raise ValueError(f"temperature is {self.temperature}; allowed is above 0, up to 1.5.")
+
+
+class DiffusionSampler:
+    """A `GraspGenerator` that denoises random poses into grasps and lets its discriminator score them.
+
+    The recipe is that of GraspGen (Murali et al. 2025): diffusion over poses conditioned on the cloud, and a
+    discriminator trained on the generator's own samples. Networks, data and weights are this project's own.
+    The view ray is known (clouds are seen from their origin); arm, table and gravity are not.
+    """
+
+    def __init__(self, config: DiffusionConfig | None = None) -> None:
+        """Load the weights.
+
+        Raises:
+            WeightsError: they are missing, damaged or of another network.
+        """
+        from models.graspgen.weights import load_weights, weights_path
+
+        self.config = config or DiffusionConfig()
+        path = self.config.weights or weights_path(self.config.gripper)
+        self._generator, self._discriminator = load_weights(path)
+
+    def sample(self, points: np.ndarray, n: int, seed: int) -> GraspSet:
+        """Return `n` grasps for `points` (M, 3) [m] seen from their origin, best score first.
+
+        Raises:
+            ValueError: fewer than 30 points, points not finite, all in one place, or not in metres.
+        """
+        points = _checked(points, n)
+        rng = np.random.default_rng(seed)
+        cloud = prepare_cloud(points, rng)
+        T_view_grasps, widths, scores = self._denoise(cloud.points, cloud.normals, n, rng)
+        order = np.argsort(-scores, kind="stable")
+        return GraspSet(
+            T_camera_grasps=cloud.T_camera_view @ T_view_grasps[order],
+            scores=scores[order],
+            widths_m=np.clip(widths[order], 0.002, self.config.max_width_m),
+            source=f"diffusion-{self.config.gripper}",
+        )
+
+    def _denoise(
+        self, points: np.ndarray, normals: np.ndarray, n: int, rng: np.random.Generator
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return poses (n, 4, 4) in the view frame, widths (n,) [m] and scores (n,)."""
+        import torch
+
+        from models.graspgen.network import N_COORDINATES, decode_grasps
+
+        cloud = torch.from_numpy(np.concatenate([points, normals], axis=1).astype(np.float32))[None]
+        noise = self.config.temperature * rng.standard_normal((1, n, N_COORDINATES))
+        with torch.inference_mode():
+            grasps = self._generator.sample(cloud, torch.from_numpy(noise.astype(np.float32)), self.config.steps)
+            scores = torch.sigmoid(self._discriminator(cloud, grasps))
+            T, widths = decode_grasps(grasps[0].double())
+        return T.numpy(), widths.numpy(), scores[0].double().numpy()
+
+
+def _checked(points: np.ndarray, n: int) -> np.ndarray:
+    points = np.asarray(points, dtype=np.float64)
+    if n < 1:
+        raise ValueError(f"Asked for {n} grasps; ask for one or more.")
+    if points.ndim != 2 or points.shape[1] != 3 or len(points) < _MIN_POINTS:
+        raise ValueError(f"Grasps need a cloud (M, 3) of {_MIN_POINTS} points or more; got {points.shape}.")
+    if not np.isfinite(points).all():
+        raise ValueError("The cloud holds points that are NaN or infinite; drop invalid depth first.")
+    extent = float(np.ptp(points, axis=0).max())
+    if not 0.002 < extent < _LARGEST_OBJECT_M:
+        raise ValueError(
+            f"The cloud spans {extent:.4g} m; allowed is 0.002 to {_LARGEST_OBJECT_M} m. "
+            "Give one object's points, in metres (not millimetres)."
+        )
+    return points

@@ -1,0 +1,114 @@
+"""Makes the grasp generator's training data: procedural shapes, noisy single views, verified antipodal grasps.
+
+    python -m scripts.make_grasp_dataset                  # 40 shards of 100 shapes × 4 views into out/graspgen/agnostic
+    python -m scripts.make_grasp_dataset --shards 2       # a small one
+
+Shards that exist are kept, so an interrupted run goes on where it stopped. Each is made from its own seed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import tyro
+from rich.progress import track
+
+from models.graspgen.cloud import prepare_cloud
+from models.graspgen.labels import GRIPPERS, GripperSpec, find_grasps
+from models.graspgen.shapes import FAMILY_WEIGHTS, make_shape
+from models.graspgen.solids import Solid
+from models.graspgen.views import ViewConfig, render_view
+
+_MIN_GRASPS = 40
+_MAX_GRASPS = 384
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config:
+    """How much data, and for which hand."""
+
+    gripper: str = "agnostic"
+    """Which hand of `models.graspgen.labels.GRIPPERS`."""
+    shards: int = 40
+    """Files to make."""
+    shapes: int = 100
+    """Shapes in a file."""
+    views: int = 4
+    """Views of each shape."""
+    seed: int = 1000
+    """Seed of the first shard; shard k takes seed + k."""
+    out: Path = Path("out/graspgen")
+    """Folder for the shards."""
+
+
+def main(config: Config) -> None:
+    """Make the shards that are missing."""
+    folder = config.out / config.gripper
+    folder.mkdir(parents=True, exist_ok=True)
+    for shard in track(range(config.shards), description="shards"):
+        path = folder / f"{config.seed + shard}.npz"
+        if path.exists():
+            continue
+        arrays = make_shard(GRIPPERS[config.gripper], config.seed + shard, config.shapes, config.views)
+        partial = path.with_suffix(".partial.npz")
+        np.savez(partial, **arrays)
+        partial.rename(path)
+
+
+def make_shard(gripper: GripperSpec, seed: int, n_shapes: int, n_views: int) -> dict[str, np.ndarray]:
+    """Return one shard's arrays; S shapes, V = S × views.
+
+    `clouds` (V, 512, 6) points and normals in the view frame, `T_view_object` (V, 4, 4), `shape` (V,) index of the
+    shape, `family` (S,), `parts` and `profiles` (S, 2, …) the solids, `grasps` (S, 384, 4, 4) in the object frame with
+    their widths (S, 384) [m], `n_grasps` (S,).
+    """
+    rng = np.random.default_rng(seed)
+    families = list(FAMILY_WEIGHTS)
+    rows: dict[str, list] = {k: [] for k in ("clouds", "T_view_object", "shape", "family", "parts", "profiles")}
+    rows |= {k: [] for k in ("grasps", "widths_m", "n_grasps")}
+    while len(rows["family"]) < n_shapes:
+        solid = make_shape(str(rng.choice(families, p=list(FAMILY_WEIGHTS.values()))), rng)
+        T, widths = find_grasps(solid, gripper, rng)
+        if len(T) < _MIN_GRASPS:
+            continue
+        views = draw_views(solid, ViewConfig(), n_views, rng)
+        for cloud, T_view_object in views:
+            rows["clouds"].append(cloud)
+            rows["T_view_object"].append(T_view_object)
+            rows["shape"].append(len(rows["family"]))
+        keep = rng.permutation(len(T))
+        rows["n_grasps"].append(min(len(T), _MAX_GRASPS))
+        keep = np.resize(keep, _MAX_GRASPS)
+        rows["grasps"].append(T[keep].astype(np.float32))
+        rows["widths_m"].append(widths[keep].astype(np.float32))
+        rows["family"].append(solid.family)
+        rows["parts"].append(_padded(solid.parts))
+        rows["profiles"].append(_padded(solid.profiles))
+    return {key: np.array(values) for key, values in rows.items()}
+
+
+def draw_views(
+    solid: Solid, config: ViewConfig, count: int, rng: np.random.Generator
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return `count` views of `solid`: cloud (512, 6) float16 in the view frame, and T_view_object (4, 4)."""
+    views: list[tuple[np.ndarray, np.ndarray]] = []
+    while len(views) < count:
+        seen = render_view(solid, config, rng)
+        if seen is None:
+            continue
+        points, T_camera_object = seen
+        cloud = prepare_cloud(points, rng)
+        rows = np.concatenate([cloud.points, cloud.normals], axis=1).astype(np.float16)
+        views.append((rows, (np.linalg.inv(cloud.T_camera_view) @ T_camera_object).astype(np.float32)))
+    return views
+
+
+def _padded(rows: np.ndarray) -> np.ndarray:
+    """Return `rows` twice at least; a part given twice leaves the union as it is."""
+    return rows if len(rows) == 2 else np.concatenate([rows, rows])
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Config))
