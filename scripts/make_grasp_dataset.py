@@ -23,6 +23,7 @@ from models.graspgen.views import ViewConfig, render_view
 
 _MIN_GRASPS = 40
 _MAX_GRASPS = 384
+_MAX_PARTS = 3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,7 +54,7 @@ def main(config: Config) -> None:
             continue
         arrays = make_shard(GRIPPERS[config.gripper], config.seed + shard, config.shapes, config.views)
         partial = path.with_suffix(".partial.npz")
-        np.savez(partial, **arrays)
+        np.savez(partial, allow_pickle=False, **arrays)
         partial.rename(path)
 
 
@@ -61,7 +62,7 @@ def make_shard(gripper: GripperSpec, seed: int, n_shapes: int, n_views: int) -> 
     """Return one shard's arrays; S shapes, V = S × views.
 
     `clouds` (V, 512, 6) points and normals in the view frame, `T_view_object` (V, 4, 4), `shape` (V,) index of the
-    shape, `family` (S,), `parts` and `profiles` (S, 2, …) the solids, `grasps` (S, 384, 4, 4) in the object frame with
+    shape, `family` (S,), `parts` and `profiles` (S, 3, …) the solids, `grasps` (S, 384, 4, 4) in the object frame with
     their widths (S, 384) [m], `n_grasps` (S,).
     """
     rng = np.random.default_rng(seed)
@@ -106,8 +107,8 @@ def draw_views(
 
 
 def _padded(rows: np.ndarray) -> np.ndarray:
-    """Return `rows` twice at least; a part given twice leaves the union as it is."""
-    return rows if len(rows) == 2 else np.concatenate([rows, rows])
+    """Return `rows` filled up to the greatest number of parts; a part given twice leaves the union as it is."""
+    return np.concatenate([rows, np.repeat(rows[-1:], _MAX_PARTS - len(rows), axis=0)])
 
 
 if __name__ == "__main__":

@@ -51,7 +51,12 @@ def main(config: Config) -> None:
     judged = judge_samples(generator, data, gripper, config.training, reporter.named("judged, share valid"))
     checkpoint = stem.with_suffix(".discriminator.pt")
     discriminator = train_discriminator(
-        generator, data, judged, config.training, checkpoint, reporter.named("discriminator")
+        generator,
+        data,
+        judged,
+        config=config.training,
+        checkpoint=checkpoint,
+        progress=reporter.named("discriminator"),
     )
     path = config.weights or weights_path(config.gripper)
     path.parent.mkdir(parents=True, exist_ok=True)

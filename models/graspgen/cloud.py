@@ -35,7 +35,7 @@ def prepare_cloud(points: np.ndarray, rng: np.random.Generator) -> ViewCloud:
     T_camera_view = find_view_frame(points)
     kept = points[rng.permutation(len(points))[:_N_FOR_NORMALS]]
     local = (kept - T_camera_view[:3, 3]) @ T_camera_view[:3, :3]
-    normals = _estimate_normals(local, np.linalg.norm(T_camera_view[:3, 3]))
+    normals = _estimate_normals(local, float(np.linalg.norm(T_camera_view[:3, 3])))
     drawn = np.resize(rng.permutation(len(local)), N_POINTS)  # a smaller cloud repeats its points
     first = _spread_first(local[drawn])
     index = np.concatenate([drawn[first], np.delete(drawn, np.unique(first))])[:N_POINTS]

@@ -51,9 +51,7 @@ class GraspData:
         picks = np.stack([np.searchsorted(b, m) for b, m in zip(bounds, marks, strict=True)])
         picks = np.minimum(picks, self.grasps.shape[1] - 1)
         rows = np.arange(len(views))[:, None]
-        return self.T_view_object[views][:, None] @ self.grasps[shapes[rows], picks], self.widths_m[
-            shapes[rows], picks
-        ]
+        return self.T_view_object[views][:, None] @ self.grasps[shapes[rows], picks], self.widths_m[shapes[rows], picks]
 
 
 def load_shards(folder: Path, limit: int | None = None) -> GraspData:

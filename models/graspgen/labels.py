@@ -168,7 +168,7 @@ def _is_free(parts, profiles, T, body, clearance):
 
 
 @njit(cache=True)
-def _close_finger(parts, profiles, T, pads, side, half):
+def _close_finger(parts, profiles, T, pads, side, half):  # noqa: PLR0917 (compiled functions take no keywords)
     """Return how far one finger closes until it touches, and the cosine of its contact's normal to the closing line."""
     cx, cy, cz = -side * T[0, 1], -side * T[1, 1], -side * T[2, 1]
     reach = np.empty(len(pads))
@@ -191,7 +191,7 @@ def _close_finger(parts, profiles, T, pads, side, half):
 
 
 @njit(cache=True)
-def _check(parts, profiles, T, body, pads, half, clearance, cos_cone):
+def _check(parts, profiles, T, body, pads, half, clearance, cos_cone):  # noqa: PLR0917
     n = len(T)
     free, antipodal = np.zeros(n, dtype=np.bool_), np.zeros(n, dtype=np.bool_)
     widths, offsets = np.full(n, np.nan), np.full(n, np.nan)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
@@ -52,7 +53,7 @@ def _fourier(x: Tensor, octaves: int = 4) -> Tensor:
 
 def _mlp(*sizes: int) -> nn.Sequential:
     layers: list[nn.Module] = []
-    for before, after in zip(sizes[:-1], sizes[1:], strict=True):
+    for before, after in pairwise(sizes):
         layers += [nn.Linear(before, after), nn.SiLU()]
     return nn.Sequential(*layers)
 
@@ -146,7 +147,7 @@ def _seen_from(v: Tensor, token_points: Tensor) -> Tensor:
     def turned(vectors: Tensor) -> Tensor:
         return (vectors @ columns).view(batch, m, count, 3).transpose(1, 2)
 
-    origin = (v[:, :, None, :3] @ R)  # (B, K, 1, 3)
+    origin = v[:, :, None, :3] @ R  # (B, K, 1, 3)
     r = turned(token_points[..., :3] / POSITION_SCALE_M) - origin
     return torch.cat([r / 2.0, torch.tanh(1.5 * r), torch.tanh(5.0 * r), turned(token_points[..., 3:])], dim=-1)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from models.graspgen.solids import BOX, CAPSULE, LATHE, TORUS, Solid, make_part, make_solid
@@ -97,17 +98,36 @@ def _l_shape(u: Draw, rng: np.random.Generator) -> list[Part]:
     ]
 
 
+def _lathe(u: Draw, rng: np.random.Generator) -> list[Part]:
+    """A random smooth outline: vases, skittles, jars, spools."""
+    height, widest = u(0.04, 0.22), u(0.015, 0.05)
+    knots = rng.uniform(0.25, 1.0, int(rng.integers(3, 7)))
+    at = np.linspace(0.0, 1.0, 14)
+    radii = widest * np.clip(CubicSpline(np.linspace(0.0, 1.0, len(knots)), knots)(at), 0.15, 1.1)
+    return [_turned([(float(r), float(z)) for r, z in zip(radii, at * height, strict=True)], 0.001)]
+
+
 def _union(u: Draw, rng: np.random.Generator) -> list[Part]:
-    first, second = rng.choice(3, 2)
+    """Two or three boxes, capsules and cylinders that meet, some square to each other, some anyhow."""
     parts = []
-    for kind, lift in ((first, -0.02), (second, 0.035)):
+    for lift in rng.permutation([-0.025, 0.03, 0.0])[: rng.integers(2, 4)]:
+        kind, slim = rng.integers(3), u(0.0, 1.0) < 0.4
+        low, high = (0.006, 0.014) if slim else (0.012, 0.036)
         origin = (u(-0.015, 0.015), u(-0.015, 0.015), lift)
-        turn = Rotation.random(random_state=int(rng.integers(2**31))).as_matrix() if u(0, 1) < 0.3 else np.eye(3)
-        sizes = (u(0.012, 0.04), u(0.012, 0.04), u(0.02, 0.05)) if kind == 0 else (u(0.012, 0.032), u(0.015, 0.05))
-        if kind < 2:
-            parts.append(make_part((BOX, CAPSULE)[kind], sizes, origin=origin, rotation=turn))
+        turn = np.eye(3)
+        if u(0.0, 1.0) < 0.3:
+            turn = Rotation.from_quat(rng.normal(size=4)).as_matrix()
+        elif u(0.0, 1.0) < 0.4:
+            turn = Rotation.from_euler("xy"[rng.integers(2)], 90.0, degrees=True).as_matrix()
+        if kind == 0:
+            sizes = (u(low, high), u(0.010, 0.04), u(0.015, 0.06))
+            parts.append(make_part(BOX, sizes, origin=origin, rotation=turn))
+            continue
+        radius, half = u(low, high), u(0.015, 0.07)
+        if kind == 1:
+            parts.append(make_part(CAPSULE, (radius, half), origin=origin, rotation=turn))
         else:
-            row, profile = _turned([(sizes[0], -sizes[1]), (sizes[0], sizes[1])])
+            row, profile = _turned([(radius, -half), (radius, half)])
             row[6:15], row[15:18] = turn.ravel(), origin
             parts.append((row, profile))
     return parts
@@ -147,19 +167,21 @@ KNOWN_FAMILIES = {
     "cone": _cone,
     "cup": _cup,
     "l_shape": _l_shape,
+    "lathe": _lathe,
     "union": _union,
 }
 """What training sees."""
 FAMILY_WEIGHTS = {
-    "box": 0.2,
-    "cylinder": 0.14,
-    "bottle": 0.16,
-    "capsule": 0.06,
-    "sphere": 0.05,
-    "cone": 0.08,
-    "cup": 0.1,
-    "l_shape": 0.09,
-    "union": 0.12,
+    "box": 0.17,
+    "cylinder": 0.11,
+    "bottle": 0.12,
+    "capsule": 0.04,
+    "sphere": 0.04,
+    "cone": 0.06,
+    "cup": 0.09,
+    "l_shape": 0.08,
+    "lathe": 0.12,
+    "union": 0.17,
 }
 """Share of each known family in a data set."""
 UNSEEN_FAMILIES = {"mug": _mug, "dumbbell": _dumbbell, "goblet": _goblet, "hammer": _hammer}

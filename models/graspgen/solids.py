@@ -119,7 +119,7 @@ def _outline_distance(profile, count, rho, z):
 def _box_distance(row, x, y, z):
     qx, qy, qz = abs(x) - row[2] + row[1], abs(y) - row[3] + row[1], abs(z) - row[4] + row[1]
     outside = np.sqrt(max(qx, 0.0) ** 2 + max(qy, 0.0) ** 2 + max(qz, 0.0) ** 2)
-    return outside + min(max(qx, max(qy, qz)), 0.0) - row[1]
+    return outside + min(max(qx, qy, qz), 0.0) - row[1]
 
 
 @njit(cache=True, fastmath=True)
@@ -148,7 +148,7 @@ def distance_at(parts, profiles, px, py, pz):
 
 
 @njit(cache=True, fastmath=True)
-def trace(parts, profiles, ox, oy, oz, dx, dy, dz, reach):
+def trace(parts, profiles, ox, oy, oz, dx, dy, dz, reach):  # noqa: PLR0917 (compiled functions take no keywords)
     """Return how far a ray runs until it touches the surface (sphere tracing); inf beyond `reach`."""
     t = 0.0
     for _ in range(80):

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -16,6 +17,7 @@ from models.graspgen.data import GraspData, augment
 from models.graspgen.labels import GripperSpec, check_grasps
 from models.graspgen.network import N_COORDINATES, Denoiser, Discriminator, decode_grasps, encode_grasps
 
+Network = TypeVar("Network", bound=nn.Module)
 Progress = Callable[[int, float], None]
 """Called with the iteration and the loss."""
 
@@ -67,7 +69,13 @@ def train_generator(data: GraspData, config: TrainingConfig, checkpoint: Path, p
         return model.loss(cloud, grasps)
 
     for iteration, loss in _descend(
-        model, average, loss_at, config.generator_rate, config.generator_iterations, config.seed, checkpoint
+        model,
+        average,
+        loss_at=loss_at,
+        rate=config.generator_rate,
+        iterations=config.generator_iterations,
+        seed=config.seed,
+        checkpoint=checkpoint,
     ):
         progress(iteration, loss)
     return average.eval()
@@ -104,6 +112,7 @@ def train_discriminator(
     generator: Denoiser,
     data: GraspData,
     judged: JudgedSamples,
+    *,
     config: TrainingConfig,
     checkpoint: Path,
     progress: Progress,
@@ -121,13 +130,19 @@ def train_discriminator(
         return F.binary_cross_entropy_with_logits(model(cloud, grasps).float(), judged.valid[rows])
 
     for iteration, loss in _descend(
-        model, average, loss_at, config.discriminator_rate, config.discriminator_iterations, config.seed, checkpoint
+        model,
+        average,
+        loss_at=loss_at,
+        rate=config.discriminator_rate,
+        iterations=config.discriminator_iterations,
+        seed=config.seed,
+        checkpoint=checkpoint,
     ):
         progress(iteration, loss)
     return average.eval()
 
 
-def _seeded(make: Callable[[], nn.Module], seed: int):
+def _seeded(make: Callable[[], Network], seed: int) -> Network:
     torch.manual_seed(seed)
     return make()
 
@@ -142,6 +157,7 @@ def _perturbed(v: Tensor) -> Tensor:
 def _descend(
     model: nn.Module,
     average: nn.Module,
+    *,
     loss_at: Callable[[np.random.Generator], Tensor],
     rate: float,
     iterations: int,

@@ -48,7 +48,7 @@ def render_view(solid: Solid, config: ViewConfig, rng: np.random.Generator) -> t
     if hit.sum() < _MIN_POINTS:
         return None
     reach = reach + _depth_error(reach, hit, rng.uniform(*config.noise_per_m), rng)
-    seen = _drop_grazing(solid, T_camera_object, rays, reach, hit, rng)
+    seen = _drop_grazing(solid, T_camera_object, rays, reach, hit=hit, rng=rng)
     points = (rays * reach[..., None])[seen]
     flying = rng.random(len(points)) < config.flying_share
     points[flying] *= 1.0 + rng.exponential(0.01, (flying.sum(), 1)) / np.linalg.norm(points[flying], axis=1)[:, None]
@@ -64,7 +64,7 @@ def _draw_pose(config: ViewConfig, rng: np.random.Generator) -> np.ndarray:
         tilted = kind < (1.0 + config.upright_share) / 2.0
         axis = np.append(rng.normal(size=2), 0.0)
         tilt = Rotation.from_rotvec(axis / np.linalg.norm(axis) * np.radians(rng.uniform(5.0, 40.0)))
-        turn = tilt if tilted else Rotation.random(random_state=int(rng.integers(2**31)))
+        turn = tilt if tilted else Rotation.from_quat(rng.normal(size=4))
     one_face = rng.random() < config.one_face_share
     azimuth = rng.integers(4) * np.pi / 2 + rng.normal(0.0, 0.04) if one_face else rng.uniform(0.0, 2 * np.pi)
     frontal = rng.random() < config.frontal_share
@@ -107,12 +107,14 @@ def _cast(solid: Solid, T_camera_object: np.ndarray, rays: np.ndarray) -> np.nda
 
 def _depth_error(reach: np.ndarray, hit: np.ndarray, noise_per_m: float, rng: np.random.Generator) -> np.ndarray:
     """Return errors like `reach` [m]: half of the spread from pixel to pixel, half in patches, growing with z²."""
-    patches = zoom(rng.normal(size=(10, 10)), np.array(reach.shape) / 10.0, order=1)
+    patches = np.asarray(zoom(rng.normal(size=(10, 10)), np.array(reach.shape) / 10.0, order=1))
     mixed = 0.75 * rng.normal(size=reach.shape) + 0.75 * patches
     return noise_per_m * np.where(hit, reach, 0.0) ** 2 * mixed
 
 
-def _drop_grazing(solid, T_camera_object, rays, reach, hit, rng) -> np.ndarray:
+def _drop_grazing(
+    solid: Solid, T_camera_object: np.ndarray, rays: np.ndarray, reach: np.ndarray, *, hit: np.ndarray, rng
+) -> np.ndarray:
     """Return the mask (52, 52) of what stays: surfaces seen at a flat angle are often lost."""
     R, t = T_camera_object[:3, :3], T_camera_object[:3, 3]
     points = (rays[hit] * reach[hit, None] - t) @ R

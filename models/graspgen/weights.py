@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -11,6 +12,7 @@ from torch import nn
 
 from models.graspgen.network import Denoiser, Discriminator
 
+Network = TypeVar("Network", bound=nn.Module)
 WEIGHTS_FOLDER = Path(__file__).resolve().parent.parent / "weights"
 
 
@@ -54,7 +56,7 @@ def load_weights(path: Path) -> tuple[Denoiser, Discriminator]:
     return _filled(Denoiser(), "generator/", arrays, path), _filled(Discriminator(), "discriminator/", arrays, path)
 
 
-def _filled(network: nn.Module, prefix: str, arrays: dict[str, torch.Tensor], path: Path):
+def _filled(network: Network, prefix: str, arrays: dict[str, torch.Tensor], path: Path) -> Network:
     state = {key.removeprefix(prefix): value for key, value in arrays.items() if key.startswith(prefix)}
     try:
         network.load_state_dict(state)
