@@ -27,6 +27,8 @@ class RuntimeConfig:
 
     detector: str = "tabletop"
     """Which detector: `tabletop` (depth above the table) or `truth` (the twin's mask, for evaluation)."""
+    generator: str = "antipodal"
+    """Which grasp generator: `antipodal` (no learning) or `diffusion` (the learned one)."""
     n_candidates: int = 800
     """Grasps the generator proposes (the paper's N)."""
     seed: int = 0
@@ -57,6 +59,7 @@ class RuntimeConfig:
     """How trajectories are handed to the servo."""
 
     def __post_init__(self) -> None:
+        _require(self.generator in ("antipodal", "diffusion"), "generator", self.generator, "antipodal or diffusion")
         _require(1 <= self.n_candidates <= 20_000, "n_candidates", self.n_candidates, "1 to 20000")
         _require(
             self.box_method in ("upright", "pca", "min_volume"),
