@@ -1,34 +1,22 @@
-"""Says whether gripper poses and whole trajectories hit the table, the arm itself, the scene or the object."""
+"""Says whether gripper poses and whole trajectories hit the table, the scene or the object that one frame saw."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
 from hal import z1
+from z1_runtime import arm_collision
+from z1_runtime.arm_collision import MAY_MEET_SCENE, ArmPoses, Problem, first_arm_problem
+from z1_runtime.cloud import transform
 from z1_runtime.gripper import mover_pose
 from z1_runtime.kinematics import Kinematics
-from z1_runtime.robot_model import CAPSULES, GRIPPER_OBSTACLES, SELF_PAIRS, GripperShape, gripper_shape
+from z1_runtime.robot_model import CAPSULES, gripper_shape
 from z1_runtime.types import JointTrajectory, Observation, Plane
-from z1_runtime.voxels import SceneIndex
+from z1_runtime.voxels import MAX_THRESHOLD_M, SceneIndex
 
-_TABLE_LINKS = ("link02", "link03", "link04", "link05")
-_OBSTACLES = np.array([c.link in GRIPPER_OBSTACLES for c in CAPSULES])
-_OVER_TABLE = np.array([c.link in _TABLE_LINKS for c in CAPSULES])
-_RADII = np.array([c.radius_m for c in CAPSULES])
-_PAIRS = np.array(
-    [
-        (i, j)
-        for link, others in SELF_PAIRS
-        for i, one in enumerate(CAPSULES)
-        for j, other in enumerate(CAPSULES)
-        if one.link == link and other.link in others
-    ]
-)
 _RIM_M, _DROP_STEP_M = 0.010, 0.002
-_SELF_VERTICES = 400  # heads of the gripper's points that are tried against the capsules, which have 10 mm to spare
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,15 +45,16 @@ class CollisionConfig:
     sample_s: float = 0.016
     """Time between two checked samples of a trajectory [s]."""
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Problem:
-    """What is hit first."""
-
-    reason: str
-    """`table`, `scene`, `self` or `object`."""
-    detail: str
-    """A sentence with the figures."""
+    def __post_init__(self) -> None:
+        thresholds = ("scene_threshold_m", "object_threshold_m", "transfer_threshold_m")
+        for name in (*thresholds, "object_halo_m", "robot_halo_m"):
+            if not 0.0 <= getattr(self, name) <= MAX_THRESHOLD_M:
+                raise ValueError(f"{name} is {getattr(self, name)}; allowed is 0 to {MAX_THRESHOLD_M} m.")
+        for name in ("table_margin_m", "link_margin_m", "table_noise_m", "cut_off_m"):
+            if not 0.0 <= getattr(self, name) < np.inf:
+                raise ValueError(f"{name} is {getattr(self, name)}; it must be finite and not negative.")
+        if not z1.CONTROL_PERIOD_S <= self.sample_s <= 0.05:
+            raise ValueError(f"sample_s is {self.sample_s}; allowed is {z1.CONTROL_PERIOD_S} to 0.05 s.")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -112,12 +101,12 @@ class CollisionChecker:
         """Index what `observation` saw; `q_frame` (7,) is where the arm was then [rad]."""
         self.config = config or CollisionConfig()
         self._kinematics = kinematics
-        self._shape: GripperShape = gripper_shape()
+        self._shape = gripper_shape()
         T_base_camera = observation.T_base_camera
         self.table = plane_in_base(observation.table, T_base_camera)
-        self.object_points = _moved(T_base_camera, observation.object_points)
+        self.object_points = transform(T_base_camera, observation.object_points)
         self.object_index = SceneIndex(self._down_to_table(self.object_points))
-        scene = _moved(T_base_camera, observation.scene_points)
+        scene = transform(T_base_camera, observation.scene_points)
         scene = scene[self.table.height_m(scene) > self.config.table_noise_m]
         scene = scene[~self.object_index.near(scene, self.config.object_halo_m)]
         own = SceneIndex(self._gripper_points(q_frame))
@@ -166,7 +155,7 @@ class CollisionChecker:
 
     def check_posture(self, q: np.ndarray) -> Problem | None:
         """Return what the arm at `q` (7,) hits: table or itself."""
-        return self._first_arm_problem(*self._poses(q[None]))
+        return first_arm_problem(ArmPoses.at(self._kinematics, q[None]), self.table, self.config.link_margin_m)
 
     def check_trajectory(
         self, trajectory: JointTrajectory, *, threshold_m: float, object_threshold_m: float = -1.0
@@ -180,53 +169,21 @@ class CollisionChecker:
         """
         step = max(1, round(self.config.sample_s / z1.CONTROL_PERIOD_S))
         q = np.concatenate([trajectory.q[:-1:step], trajectory.q[-1:]])
-        links, pivots = self._poses(q)
-        problem = self._first_arm_problem(links, pivots)
+        poses = ArmPoses.at(self._kinematics, q)
+        problem = first_arm_problem(poses, self.table, self.config.link_margin_m)
         if problem is not None:
             return problem
         hits = self.check_grippers(
-            pivots, q[:, -1], scene_threshold_m=threshold_m, object_threshold_m=object_threshold_m
+            poses.pivots, q[:, -1], scene_threshold_m=threshold_m, object_threshold_m=object_threshold_m
         )
         blocked = ~hits.free()
         if blocked.any():
             return hits.problem(int(blocked.argmax()))
-        return self._first_link_hit(links)
-
-    def _poses(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return T_base_link (N, C, 4, 4) of every capsule's link and T_base_pivot (N, 4, 4) at joints (N, 7)."""
-        links = np.empty((len(q), len(CAPSULES), 4, 4))
-        pivots = np.empty((len(q), 4, 4))
-        for n, joints in enumerate(q):
-            poses = self._kinematics.link_poses(joints)
-            for c, capsule in enumerate(CAPSULES):
-                links[n, c] = poses[capsule.link]
-            pivots[n] = poses["link06"] @ z1.T_FLANGE_PIVOT
-        return links, pivots
-
-    def _first_arm_problem(self, links: np.ndarray, pivots: np.ndarray) -> Problem | None:
-        ends = np.einsum("ncij,cej->ncei", links[..., :3, :3], _ENDS) + links[:, :, None, :3, 3]  # (N, C, 2, 3)
-        heights = (ends @ self.table.normal - self.table.offset_m).min(axis=2) - _RADII
-        heights[:, ~_OVER_TABLE] = np.inf
-        if (heights < self.config.link_margin_m).any():
-            n, c = np.unravel_index(heights.argmin(), heights.shape)
-            return Problem(
-                reason="table",
-                detail=f"{CAPSULES[c].link} would be {heights[n, c] * 1e3:.0f} mm above the table; "
-                f"allowed is {self.config.link_margin_m * 1e3:.0f} mm.",
-            )
-        one, other = _first_capsule_pair(ends, _RADII, _PAIRS)
-        if one >= 0:
-            return Problem(reason="self", detail=f"{CAPSULES[one].link} would hit {CAPSULES[other].link}.")
-        vertices = self._shape.fixed[:_SELF_VERTICES]
-        c = _first_capsule_hit(pivots, vertices, np.ascontiguousarray(ends[:, _OBSTACLES]), _RADII[_OBSTACLES])
-        if c >= 0:
-            link = [capsule.link for capsule in CAPSULES if capsule.link in GRIPPER_OBSTACLES][c]
-            return Problem(reason="self", detail=f"gripper or camera would hit {link}.")
-        return None
+        return self._first_link_hit(poses.links)
 
     def _first_link_hit(self, links: np.ndarray) -> Problem | None:
         for c, capsule in enumerate(CAPSULES):
-            if not _OVER_TABLE[c]:
+            if not MAY_MEET_SCENE[c]:
                 continue
             _, hit = self.scene_index.first_hits(links[:, c], _LINK_SURFACES[c], self.config.transfer_threshold_m)
             if (hit >= 0).any():
@@ -250,7 +207,7 @@ class CollisionChecker:
     def _gripper_points(self, q: np.ndarray) -> np.ndarray:
         T_base_pivot = self._kinematics.pivot(q[: z1.N_ARM])
         T_base_mover = T_base_pivot @ mover_pose(float(q[-1]))
-        return np.concatenate([_moved(T_base_pivot, self._shape.fixed), _moved(T_base_mover, self._shape.mover)])
+        return np.concatenate([transform(T_base_pivot, self._shape.fixed), transform(T_base_mover, self._shape.mover)])
 
 
 def warm_up() -> None:
@@ -260,19 +217,13 @@ def warm_up() -> None:
     index.near(point, 0.0)
     for vertices in (point, read_only):  # compiled apart
         index.first_hits(pose, vertices, 0.0)
-    ends = np.zeros((1, 1, 2, 3))
-    _first_capsule_hit(pose, read_only, ends, np.zeros(1))
-    _first_capsule_pair(ends, np.zeros(1), np.zeros((1, 2), dtype=np.int64))
+    arm_collision.warm_up()
 
 
 def plane_in_base(plane: Plane, T_base_camera: np.ndarray) -> Plane:
     """Return a camera-frame plane in the base frame."""
     normal = T_base_camera[:3, :3] @ plane.normal
     return Plane(normal=normal, offset_m=float(plane.offset_m + normal @ T_base_camera[:3, 3]))
-
-
-def _moved(T: np.ndarray, points: np.ndarray) -> np.ndarray:
-    return points @ T[:3, :3].T + T[:3, 3]
 
 
 def _metres(point: np.ndarray) -> str:
@@ -291,57 +242,4 @@ def _capsule_surface(start: np.ndarray, end: np.ndarray, radius_m: float) -> np.
     return (start + along * (end - start) + radius_m * ring).reshape(-1, 3)
 
 
-_ENDS = np.array([[c.start, c.end] for c in CAPSULES])
 _LINK_SURFACES = [_capsule_surface(np.array(c.start), np.array(c.end), c.radius_m) for c in CAPSULES]
-
-
-@njit(cache=True, nogil=True)
-def _squared_distance(p, a, b):
-    """Return the squared distance of point `p` from segment `a` `b`."""
-    along = 0.0
-    length = 0.0
-    for i in range(3):
-        along += (p[i] - a[i]) * (b[i] - a[i])
-        length += (b[i] - a[i]) ** 2
-    t = 0.0 if length <= 0.0 else min(max(along / length, 0.0), 1.0)
-    total = 0.0
-    for i in range(3):
-        total += (p[i] - a[i] - t * (b[i] - a[i])) ** 2
-    return total
-
-
-@njit(cache=True, nogil=True)
-def _first_capsule_hit(T, vertices, ends, radii):
-    """Return the first capsule (index) that any of `vertices`, moved by `T[n]`, is inside of at pose n, or −1."""
-    p = np.empty(3)
-    for n in range(T.shape[0]):
-        for v in range(vertices.shape[0]):
-            for i in range(3):
-                p[i] = T[n, i, 3]
-                for j in range(3):
-                    p[i] += T[n, i, j] * vertices[v, j]
-            for c in range(radii.shape[0]):
-                if _squared_distance(p, ends[n, c, 0], ends[n, c, 1]) < radii[c] ** 2:
-                    return c
-    return -1
-
-
-@njit(cache=True, nogil=True)
-def _first_capsule_pair(ends, radii, pairs):
-    """Return the first two capsules of `pairs` that overlap at any pose, or (−1, −1).
-
-    The shorter way to two segments' distance: one is walked in 6 mm steps, which its radius covers.
-    """
-    p = np.empty(3)
-    for n in range(ends.shape[0]):
-        for k in range(pairs.shape[0]):
-            one, other = pairs[k, 0], pairs[k, 1]
-            a, b = ends[n, one, 0], ends[n, one, 1]
-            steps = int(np.sqrt((b[0] - a[0]) ** 2 + (b[1] - a[1]) ** 2 + (b[2] - a[2]) ** 2) / 0.006) + 1
-            for s in range(steps + 1):
-                for i in range(3):
-                    p[i] = a[i] + (b[i] - a[i]) * s / steps
-                reach = radii[one] + radii[other]
-                if _squared_distance(p, ends[n, other, 0], ends[n, other, 1]) < reach**2:
-                    return one, other
-    return -1, -1

@@ -16,12 +16,14 @@ _CELLS = 8  # per block and axis
 _BLOCK_M = _CELL_M * _CELLS
 _PER_BLOCK = _CELLS**3
 _ROUNDING_M = 1e-9
+MAX_THRESHOLD_M = 0.010
+"""The largest distance an index is asked for unless it was told otherwise [m]."""
 
 
 class SceneIndex:
     """A cloud that can be asked whether anything comes near it. Built once per frame."""
 
-    def __init__(self, points: np.ndarray, max_threshold_m: float = 0.010) -> None:
+    def __init__(self, points: np.ndarray, max_threshold_m: float = MAX_THRESHOLD_M) -> None:
         """Index `points` (M, 3) [m]; later thresholds may be up to `max_threshold_m` [m].
 
         Raises:

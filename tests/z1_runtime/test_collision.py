@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from tabletop_scenes import Q_START, camera_pose, cylinder, frontal, make_observation, wall
 
 from hal import z1
-from z1_runtime.collision import CollisionChecker
+from z1_runtime.collision import CollisionChecker, CollisionConfig
 from z1_runtime.gripper import BeakGripper
 from z1_runtime.kinematics import Kinematics
 from z1_runtime.robot_model import CAPSULES, gripper_shape
@@ -107,6 +107,29 @@ def test_an_arm_folded_into_its_own_base_is_found(checker):
     problem = checker.check_posture(FOLDED_INTO_BASE)
     assert problem is not None
     assert problem.reason == "self"
+
+
+def test_an_open_jaw_that_swings_into_the_forearm_is_found(checker):
+    q = np.array([-1.25, 0.39, -0.81, 1.45, -0.64, -1.67, 0.0])
+    assert checker.check_posture(q) is None
+    q[-1] = z1.GRIPPER_OPEN
+    problem = checker.check_posture(q)
+    assert problem is not None
+    assert problem.reason == "self"
+    assert "moving jaw" in problem.detail
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"transfer_threshold_m": 0.02}, "transfer_threshold_m is 0.02; allowed is 0 to 0.01"),
+        ({"link_margin_m": -0.01}, "link_margin_m is -0.01"),
+        ({"sample_s": float("nan")}, "sample_s is nan"),
+    ],
+)
+def test_distances_that_make_no_sense_are_refused(wrong, said):
+    with pytest.raises(ValueError, match=said):
+        CollisionConfig(**wrong)
 
 
 def test_an_arm_reaching_into_the_table_is_found(checker):
