@@ -73,9 +73,9 @@ class GraspCheck:
     free: np.ndarray
     """(N,) bool, the open hand touches nothing."""
     antipodal: np.ndarray
-    """(N,) bool, both pads touch, each within the friction cone."""
+    """(N,) bool, both pads of a free hand touch, each within the friction cone."""
     widths_m: np.ndarray
-    """(N,) distance between the contacts [m]; NaN where a pad touches nothing."""
+    """(N,) distance between the contacts [m]; NaN where a pad touches nothing or the hand is not free."""
     offsets_m: np.ndarray
     """(N,) how far the contacts' middle lies from the grasp's origin along y [m]; NaN as above."""
 
@@ -107,7 +107,7 @@ def check_grasps(
 
 
 def find_grasps(
-    solid: Solid, gripper: GripperSpec, rng: np.random.Generator, n_contacts: int = 1500, n_turns: int = 4
+    solid: Solid, gripper: GripperSpec, rng: np.random.Generator, n_contacts: int = 900, n_turns: int = 4
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return ground-truth grasps (N, 4, 4) of `solid` from all sides and their widths (N,) [m].
 
@@ -197,6 +197,8 @@ def _check(parts, profiles, T, body, pads, half, clearance, cos_cone):  # noqa: 
     widths, offsets = np.full(n, np.nan), np.full(n, np.nan)
     for i in range(n):
         free[i] = _is_free(parts, profiles, T[i], body, clearance)
+        if not free[i]:
+            continue
         left, cos_left = _close_finger(parts, profiles, T[i], pads, 1.0, half)
         if left == np.inf:
             continue
