@@ -12,6 +12,12 @@ HAND = GRIPPERS["agnostic"]
 BRICK = make_solid("box", [make_part(BOX, (0.02, 0.03, 0.08))])
 
 
+def look(config: ViewConfig, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    seen = render_view(BRICK, config, np.random.default_rng(seed))
+    assert seen is not None
+    return seen
+
+
 def grasp(closing: tuple, approach: tuple, at: tuple) -> np.ndarray:
     y, z = np.array(closing, dtype=float), np.array(approach, dtype=float)
     T = np.eye(4)
@@ -114,7 +120,7 @@ def test_every_family_can_be_made_and_grasped_and_none_is_in_both_sets():
 
 def test_a_view_shows_the_near_side_within_the_camera_noise():
     view = ViewConfig(distance_m=(0.3, 0.3), noise_per_m=(0.005, 0.005), flying_share=0.0, occluded_share=0.0)
-    points, T_camera_object = render_view(BRICK, view, np.random.default_rng(3))
+    points, T_camera_object = look(view, 3)
     T_object_camera = np.linalg.inv(T_camera_object)
     local = points @ T_object_camera[:3, :3].T + T_object_camera[:3, 3]
     assert np.quantile(np.abs(BRICK.distance(local)), 0.9) < 3 * 0.005 * 0.3**2
@@ -130,7 +136,7 @@ def test_elevation_is_the_cameras_height_over_the_object(elevation):
     )
     eyes = []
     for seed in range(12):
-        _, T_camera_object = render_view(BRICK, view, np.random.default_rng(seed))
+        _, T_camera_object = look(view, seed)
         eye = np.linalg.inv(T_camera_object)[:3, 3]
         eyes.append(np.degrees(np.arcsin(eye[2] / np.linalg.norm(eye))))
     assert np.mean(eyes) == pytest.approx(elevation, abs=6.0)
@@ -141,7 +147,7 @@ def test_depth_noise_grows_with_the_square_of_the_distance():
         config = ViewConfig(
             distance_m=(distance, distance), noise_per_m=(0.01, 0.01), flying_share=0.0, occluded_share=0.0
         )
-        points, T_camera_object = render_view(BRICK, config, np.random.default_rng(5))
+        points, T_camera_object = look(config, 5)
         T = np.linalg.inv(T_camera_object)
         return float(np.median(np.abs(BRICK.distance(points @ T[:3, :3].T + T[:3, 3]))))
 
@@ -150,6 +156,6 @@ def test_depth_noise_grows_with_the_square_of_the_distance():
 
 def test_occlusion_hides_the_asked_share():
     config = ViewConfig(occluded_share=1.0, hidden=(0.35, 0.35))
-    full = render_view(BRICK, ViewConfig(occluded_share=0.0), np.random.default_rng(2))[0]
-    part = render_view(BRICK, config, np.random.default_rng(2))[0]
+    full = look(ViewConfig(occluded_share=0.0), 2)[0]
+    part = look(config, 2)[0]
     assert len(part) / len(full) == pytest.approx(0.65, abs=0.02)
