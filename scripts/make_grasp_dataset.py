@@ -1,6 +1,6 @@
 """Makes the grasp generator's training data: procedural shapes, noisy single views, verified antipodal grasps.
 
-    python -m scripts.make_grasp_dataset                  # 40 shards of 100 shapes × 4 views into out/graspgen/agnostic
+    python -m scripts.make_grasp_dataset                  # 24 shards of 100 shapes × 4 views into out/graspgen/agnostic
     python -m scripts.make_grasp_dataset --shards 2       # a small one
 
 Shards that exist are kept, so an interrupted run goes on where it stopped. Each is made from its own seed.
@@ -32,7 +32,7 @@ class Config:
 
     gripper: str = "agnostic"
     """Which hand of `models.graspgen.labels.GRIPPERS`."""
-    shards: int = 40
+    shards: int = 24
     """Files to make."""
     shapes: int = 100
     """Shapes in a file."""

@@ -26,7 +26,7 @@ Progress = Callable[[int, float], None]
 class TrainingConfig:
     """How long and how fast; the recipe that is written beside the weights."""
 
-    generator_iterations: int = 8000
+    generator_iterations: int = 7000
     generator_rate: float = 1.5e-3
     views_per_batch: int = 20
     grasps_per_view: int = 72
