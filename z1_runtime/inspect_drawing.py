@@ -109,7 +109,10 @@ def draw_plan(plan: GraspPlan, robot: RobotDrawing) -> Drawing:
     yield blueprint.PATH, rr.LineStrips3D([robot.pivot_path(q) for q in legs], colors=colours, radii=0.001)
     refused = Counter(rejection.reason for rejection in plan.rejections)
     why = ", ".join(f"{n} × {reason}" for reason, n in refused.most_common()) or "none"
-    yield blueprint.LOG, rr.TextLog(f"takes candidate {plan.rank}; refused before it: {why}", level="INFO")
+    yield (
+        blueprint.LOG,
+        rr.TextLog(f"takes candidate {plan.rank} ({plan.ik_method} joints); refused: {why}", level="INFO"),
+    )
 
 
 def draw_arm(state: ArmState, status: ServoStatus, robot: RobotDrawing) -> Drawing:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 import pinocchio as pin  # pyright: ignore[reportMissingImports] - a .pth file leads to it
 
 from hal import z1
 from z1_runtime.se3 import check_pose, error_twist, inverse, pose_error
+from z1_runtime.types import IkMethod
 
 POSITION_TOLERANCE_M = 0.002
 """The paper's tolerance of its least-squares solution [m]."""
@@ -66,7 +66,7 @@ class IkResult:
     """(6,) arm joints, inside the limits [rad]."""
     n_branches: int
     """How many analytic branches lie inside the limits; 0 when least squares found it."""
-    method: Literal["analytic", "least_squares"]
+    method: IkMethod
     position_error_m: float
     """Distance between the pose asked and the pose reached [m]."""
     rotation_error_rad: float

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
 from hal.messages import RgbdFrame
 from models.types import Detection
+
+IkMethod = Literal["analytic", "least_squares"]
+"""How joints were found: exactly, or within 2 mm and 1° of the pose."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -89,7 +93,7 @@ class GraspPlan:
     width_m: float
     """Object width between the jaws [m]."""
     T_base_pivot: np.ndarray
-    """(4, 4) gripper pivot at the grasp."""
+    """(4, 4) gripper pivot at the grasp, where the joints really put it."""
     jaw_open: float
     """Mover angle while approaching [rad]."""
     jaw_contact: float
@@ -103,4 +107,6 @@ class GraspPlan:
     lift: JointTrajectory
     """Straight up with the object, jaw command closed."""
     rejections: tuple[Rejection, ...]
-    """Why the candidates before this one were refused."""
+    """Why the other candidates tried were refused: those before this one, and after least squares all others."""
+    ik_method: IkMethod = "analytic"
+    """How its joints were found; `least_squares` only after all candidates were refused with analytic ones."""

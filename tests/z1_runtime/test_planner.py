@@ -19,6 +19,7 @@ from tabletop_scenes import (
 
 from hal import z1
 from models.types import GraspSet
+from z1_runtime.candidates import Candidates
 from z1_runtime.collision import CollisionChecker
 from z1_runtime.kinematics import Kinematics
 from z1_runtime.planner import GraspPlanner, NoPlanError, PlannerConfig
@@ -158,6 +159,52 @@ def test_the_first_that_passes_is_taken_and_the_refused_are_reported(planner, ki
     assert plan.approach.q == pytest.approx(alone.approach.q)
 
 
+JUST_OUT_OF_REACH = (0.48, 0.0, 0.089, 0.16, -0.83)
+
+
+def test_a_grasp_just_out_of_reach_is_planned_within_the_paper_s_tolerance(planner, kinematics):
+    observation = scene(kinematics, 0.48, 0.0)
+    grasps = in_camera(observation.T_base_camera, [frontal(*JUST_OUT_OF_REACH)])
+    plan = planner.plan(grasps, observation, Q_START)
+    assert plan.ik_method == "least_squares"
+    assert plan.rejections == ()
+    at_grasp = kinematics.pivot(plan.approach.q[-1, : z1.N_ARM])
+    assert max(pose_error(at_grasp, plan.T_base_pivot)) < 1e-4
+    checker = CollisionChecker(kinematics, observation, Q_START)
+    wished = Candidates(grasps, observation.T_base_camera, planner.gripper, checker, fallback_width_m=0.06).ways(0)
+    assert isinstance(wished, list)
+    assert not any(kinematics.solve(way.T_base_pivot) for way in wished)
+    errors = [pose_error(at_grasp, way.T_base_pivot) for way in wished]
+    assert any(0.0 < away_m <= 0.002 and turned_rad <= np.deg2rad(1.0) for away_m, turned_rad in errors)
+    for leg in (plan.transfer, plan.approach, plan.close, plan.lift):
+        assert (leg.q >= z1.Q_MIN).all()
+        assert (leg.q <= z1.Q_MAX).all()
+
+
+def test_a_grasp_within_reach_goes_before_a_better_one_within_tolerance(planner, kinematics):
+    observation = scene(kinematics, 0.48, 0.0)
+    both = in_camera(
+        observation.T_base_camera,
+        [frontal(*JUST_OUT_OF_REACH), frontal(0.48, 0.0, 0.09, np.deg2rad(20))],
+    )
+    plan = planner.plan(both, observation, Q_START)
+    assert (plan.rank, plan.ik_method) == (1, "analytic")
+    assert [rejection.reason for rejection in plan.rejections] == ["ik"]
+
+
+def test_least_squares_comes_last_is_bounded_and_says_how_far_away_it_stayed(planner, kinematics):
+    observation = scene(kinematics, 0.48, 0.0)
+    far = frontal(0.9, 0.0, 0.09, 0.4)
+    grasps = in_camera(observation.T_base_camera, [far, frontal(*JUST_OUT_OF_REACH), far])
+    plan = planner.plan(grasps, observation, Q_START)
+    assert (plan.rank, plan.ik_method) == (1, "least_squares")
+    assert [rejection.rank for rejection in plan.rejections] == [0, 2]
+    assert "allowed is 2 mm and 1°. (least squares)" in plan.rejections[0].detail
+    assert "least squares" not in plan.rejections[1].detail
+    tight = GraspPlanner(kinematics, PlannerConfig(max_least_squares=1))  # spent on the first
+    assert [reason for reason, _ in refusals(tight, grasps, observation)] == ["ik"] * 3
+
+
 def test_unknown_widths_are_measured_in_the_cloud(planner, kinematics):
     observation = scene(kinematics, 0.48, 0.0)
     unsaid = candidates(observation, 0.48, 0.0, width_m=np.nan)
@@ -181,3 +228,7 @@ def test_no_candidates_and_a_spent_budget_are_said_plainly(kinematics, planner):
 def test_a_configuration_that_makes_no_sense_is_refused():
     with pytest.raises(ValueError, match="short_standoff_m <= standoff_m"):
         PlannerConfig(standoff_m=0.05, short_standoff_m=0.06)
+    with pytest.raises(ValueError, match="max_least_squares is -1"):
+        PlannerConfig(max_least_squares=-1)
+    with pytest.raises(ValueError, match="raise_m is nan"):
+        PlannerConfig(raise_m=float("nan"))

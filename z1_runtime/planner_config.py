@@ -1,0 +1,46 @@
+"""The numbers of the planner."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from z1_runtime.collision import CollisionConfig
+from z1_runtime.gripper import BeakConfig
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlannerConfig:
+    """How a grasp is approached and lifted, and how long to search."""
+
+    standoff_m: float = 0.09
+    """From the pre-grasp to the grasp along the approach [m]."""
+    short_standoff_m: float = 0.06
+    """Tried where the arm cannot draw back that far [m]."""
+    lift_m: float = 0.10
+    """Straight up after closing [m]."""
+    fallback_width_m: float = 0.06
+    """Taken where neither the generator nor the cloud tells a width [m]."""
+    max_tried: int = 60
+    """Reachable candidates whose motion is planned before giving up; bounds the worst case."""
+    max_least_squares: int = 60
+    """Poses without joints that are given to least squares once all candidates were refused, 1 to 3 ms each;
+    0 leaves it out."""
+    max_branches: int = 2
+    """Joint solutions tried per pre-grasp, nearest to home first."""
+    raise_m: float = 0.12
+    """How far above the pre-grasp the detour leads, when the direct way is blocked [m]."""
+    beak: BeakConfig = field(default_factory=BeakConfig)
+    """How the beak is laid around an object."""
+    collision: CollisionConfig = field(default_factory=CollisionConfig)
+    """How near is a collision."""
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.short_standoff_m <= self.standoff_m or self.lift_m <= 0.0 or self.max_tried < 1:
+            raise ValueError(
+                "PlannerConfig wants 0 < short_standoff_m <= standoff_m, lift_m > 0 and max_tried >= 1; got "
+                f"{self.short_standoff_m}, {self.standoff_m}, {self.lift_m} and {self.max_tried}."
+            )
+        for name in ("max_least_squares", "max_branches", "raise_m", "fallback_width_m"):
+            least = 1 if name == "max_branches" else 0
+            if not least <= getattr(self, name) < float("inf"):
+                raise ValueError(f"{name} is {getattr(self, name)}; it must be finite and at least {least}.")
