@@ -62,7 +62,7 @@ class ClippedSetpoint(NamedTuple):
     q: np.ndarray
     """(7,) joint positions [rad]."""
     dq: np.ndarray
-    """(7,) joint velocities [rad/s]."""
+    """(7,) joint velocities [rad/s]; 0 where the position wished lies outside the joint limits."""
     clipped: bool
     """True when an arm joint could not have what was wished (a squeezing gripper is no exception)."""
 
@@ -85,6 +85,8 @@ def clip_setpoint(
     """
     allowed = np.minimum(np.maximum(q, limits.q_min), limits.q_max)
     velocity = np.minimum(np.maximum(dq, -limits.dq_max), limits.dq_max)
+    # Position servos add their damping times this speed: at a limit it would push beyond it.
+    velocity[allowed != q] = 0.0
     lead_rad = limits.grip_torque_nm / z1.KP[_GRIPPER]
     grip = min(max(allowed[_GRIPPER], q_measured[_GRIPPER] - lead_rad), q_measured[_GRIPPER] + lead_rad)
     if grip != allowed[_GRIPPER]:

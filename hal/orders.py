@@ -1,8 +1,9 @@
 """What producers ask of the servo: the lease, the queue of trajectory pieces, single setpoints, the latched stop.
 
 Any thread calls the methods, which take `_lock` to keep the producers apart. The tick takes no lock: it reads and
-replaces whole attributes holding immutable objects (`playback`, `target`, `latch`, `done_id`), which Python does
-atomically. A stop therefore takes effect at the next tick whatever else is going on.
+replaces whole attributes holding immutable objects (`playback`, `target`, `latch`), which Python does atomically, and
+what is counted up has one writer each (`cancelled_id` the producers, `played_id` the tick). A stop therefore takes
+effect at the next tick whatever else is going on.
 """
 
 from __future__ import annotations
@@ -67,8 +68,10 @@ class Orders:
             self.target: Target | None = None
             self.latch = ""
             """Why the servo is stopped; empty when it is not."""
-            self.done_id = 0
-            """Trajectories up to this one are over."""
+            self.cancelled_id = 0
+            """Trajectories up to this one are over because a producer said so."""
+            self.played_id = 0
+            """Trajectories up to this one are over because the tick said so."""
             self.cancel_reason = ""
             """Why the last one was cut short by a producer."""
             self.rearmed = False
@@ -78,15 +81,20 @@ class Orders:
             self.lease.clear()
 
     @property
+    def done_id(self) -> int:
+        """Trajectories up to this one are over."""
+        return max(self.cancelled_id, self.played_id)
+
+    @property
     def current(self) -> playback.Playback | None:
         """The trajectory that is to be played; None when none is."""
         newest = self.playback
         return newest if newest is not None and newest.trajectory_id > self.done_id else None
 
     def finish(self, trajectory: playback.Playback | None) -> None:
-        """Call `trajectory` over, and all before it."""
+        """Call `trajectory` over, and all before it; for the tick."""
         if trajectory is not None:
-            self.done_id = max(self.done_id, trajectory.trajectory_id)
+            self.played_id = trajectory.trajectory_id
 
     def claim(self, owner: str, now_s: float, *, at_rest: bool) -> None:
         """Take the lease (errors as `Lease.claim`)."""
@@ -115,6 +123,7 @@ class Orders:
         """Lift a latched stop and free the lease."""
         with self._lock:
             if self.latch:
+                self._drop()  # what was taken while the tick found a fault
                 self.latch = ""
                 self.lease.clear()
                 self.rearmed = True
@@ -135,7 +144,7 @@ class Orders:
                     f"the next one is {newest + 1} or more."
                 )
             self._check_start(chunk, snapshot)
-            self.playback = playback.begin(chunk, self._limits)
+            self.target, self.playback = None, playback.begin(chunk, self._limits)
 
     def send(self, setpoint: ArmSetpoint, owner: str | None, now_s: float) -> None:
         """Make `setpoint` the target (errors as `hal.servo.Servo.send`)."""
@@ -154,8 +163,12 @@ class Orders:
 
     def _cancel(self, reason: str) -> None:
         self.cancel_reason = reason
+        self._drop()
+
+    def _drop(self) -> None:
         self.target = None
-        self.finish(self.playback)
+        if self.playback is not None:
+            self.cancelled_id = self.playback.trajectory_id
 
     def _check_start(self, chunk: TrajectoryChunk, snapshot: Snapshot) -> None:
         # A squeezing gripper's command leads its measurement, so there the command counts, before or after limits.

@@ -22,9 +22,15 @@ class PeriodStatistics:
         self.ticks = 0
         """Cycles since the start."""
         self.overruns = 0
-        """Cycles that began more than half a period late."""
-        self.measured = False
-        """True while a thread on the wall clock ticks; in lock-step a period says nothing about the machine."""
+        """Cycles that began more than half a period late, seen from the cycle before."""
+        self._measured = False
+
+    def measure(self, on: bool) -> None:
+        """Keep the periods from now on, or no more: for a thread on the wall clock that begins or ends its ticks.
+
+        In lock-step a period says nothing about the machine. The time between two threads is no period.
+        """
+        self._measured, self._last_s = on, None
 
     def record(self, now_s: float) -> None:
         """A cycle began at `now_s` [s]."""
@@ -35,7 +41,7 @@ class PeriodStatistics:
         period_s = now_s - last
         if period_s > 1.5 * CONTROL_PERIOD_S:
             self.overruns += 1
-        if self.measured:
+        if self._measured:
             self._ring_s[self._next] = period_s
             self._next = (self._next + 1) % len(self._ring_s)
             self._filled = min(self._filled + 1, len(self._ring_s))

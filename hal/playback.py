@@ -14,6 +14,8 @@ from hal.z1 import CONTROL_PERIOD_S, JOINT_NAMES
 
 MAX_GAP_S = 0.05
 """A chunk starts at the time where the last one ended or at most this much later [s]."""
+MAX_POINTS = 10_000
+"""So much may wait to be played: 20 s at the servo's rate. Checking it must not hold up a stop."""
 _SAME_TIME_S = 1e-6
 _KEEP_S = 0.1
 
@@ -102,6 +104,11 @@ def extend(old: Playback, chunk: TrajectoryChunk, played_s: float, limits: Servo
 
 
 def _check_points(trajectory_id: int, t_s: np.ndarray, q: np.ndarray, dq: np.ndarray, limits: ServoLimits) -> None:
+    if len(t_s) > MAX_POINTS:
+        raise CommandRefusedError(
+            f"trajectory {trajectory_id} would have {len(t_s)} points buffered; allowed are {MAX_POINTS}. "
+            f"Send it in pieces, about 0.2 s before they are due."
+        )
     outside = np.maximum(limits.q_min - q, q - limits.q_max)
     if outside.max() > 1e-6:
         i, j = np.unravel_index(int(outside.argmax()), outside.shape)

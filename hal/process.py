@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import logging
+import os
 import signal
 from collections.abc import Callable
 from contextlib import ExitStack
-from threading import Event
+from threading import Event, Thread
 
 from hal.bus.server import HalServer
 from hal.bus.session import BusConfig
@@ -27,8 +28,16 @@ _LOOK_S = 0.05
 
 def stop_on_signals(stop_event: Event) -> None:
     """Set `stop_event` at SIGTERM, SIGINT and SIGHUP; for the main thread, before `serve`."""
+    # A handler interrupts the main thread, which may hold the event's own lock: another thread has to set it.
+    heard, told = os.pipe()
+
+    def wait() -> None:
+        os.read(heard, 1)
+        stop_event.set()
+
+    Thread(target=wait, name="signals", daemon=True).start()
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
-        signal.signal(number, lambda *_: stop_event.set())
+        signal.signal(number, lambda *_: os.write(told, b"!"))
 
 
 def serve(

@@ -66,6 +66,7 @@ class Servo:
         # Read and written by whoever asks for the status.
         self._clips_told = 0
         self._told_s = -np.inf
+        self._latch_told = ""
 
     # --- Life -----------------------------------------------------------------------------------------------
 
@@ -196,7 +197,7 @@ class Servo:
         """Return the servo's account of its last tick; built on request, so that the tick need not."""
         snapshot = self._connected()
         now_s = self.clock.now_s()
-        self._tell_clips(now_s)
+        self._tell(now_s)
         p50, p999 = self.periods.summary_ms()
         current = self._orders.current
         buffered_s = 0.0
@@ -219,7 +220,15 @@ class Servo:
             period_ms_p999=p999,
         )
 
-    def _tell_clips(self, now_s: float) -> None:
+    def _tell(self, now_s: float) -> None:
+        """Log what the tick must not."""
+        latch = self._orders.latch
+        if latch != self._latch_told:
+            self._latch_told = latch
+            if latch:
+                log.warning("servo: stopped: %s. Look at the arm, then `./z1 rearm`.", latch)
+            else:
+                log.info("servo: re-armed.")
         clips = self._clips + self._orders.beyond
         if clips != self._clips_told and now_s - self._told_s >= _WARN_EVERY_S:
             log.warning("servo: %d setpoints were clipped to the limits.", clips - self._clips_told)
@@ -331,7 +340,8 @@ class Servo:
 
     def _publish(self, now_s: float) -> None:
         motion = self._motion
-        stopped = bool(self._orders.latch) and motion.mode is not ServoMode.BRAKING
+        # A stop may come in the middle of a tick: what still tracks is not stopped yet.
+        stopped = bool(self._orders.latch) and motion.mode is ServoMode.HOLDING
         self._snapshot = Snapshot(
             stamp_s=now_s,
             mode=ServoMode.STOPPED if stopped else motion.mode,

@@ -64,7 +64,7 @@ class ServoThread:
         self._end.set()
         self._thread.join()
         self._thread = None
-        self._servo.periods.measured = False
+        self._servo.periods.measure(False)
         if self._error is not None:
             raise self._error
 
@@ -84,7 +84,7 @@ class ServoThread:
 
     def _run(self) -> None:
         _prepare(self._cpu)
-        self._servo.periods.measured = True
+        self._servo.periods.measure(True)
         try:
             self._tick_for_ever()
         except Exception as error:  # every kind: a servo that dies must say so and leave the arm stopped
@@ -115,7 +115,7 @@ def _prepare(cpu: int | None) -> None:
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_FIFO_PRIORITY))
         granted.append("SCHED_FIFO")
-    except (PermissionError, OSError):
+    except OSError:
         pass
     if cpu is not None:
         try:

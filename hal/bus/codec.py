@@ -200,7 +200,8 @@ def _checked(value: Any, hint: Any, label: str) -> Any:
 
 def _take_array(body: memoryview, at: int, shape: Any, dtype: np.dtype, label: str) -> tuple[np.ndarray, int]:
     good = isinstance(shape, list) and len(shape) <= 4 and all(type(n) is int and 0 <= n <= MAX_BYTES for n in shape)
-    if not good:
+    # Also of an empty array: numpy multiplies the lengths that are not zero.
+    if not good or math.prod(max(n, 1) for n in shape) > MAX_BYTES:
         raise InvalidMessageError(f"{label} has shape {str(shape)[:80]}; it must be a short list of lengths.")
     end = at + math.prod(shape) * dtype.itemsize
     if end > len(body):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import logging
 import os
 import struct
@@ -61,7 +62,8 @@ class FrameBuffers:
         before = existing_segments()
         size = _FRAMES_IN_POOL * (_BYTES_PER_PIXEL * intrinsics.width * intrinsics.height + 4096)
         self._provider = _make_provider(size) if shared else None
-        self._segments = mapped_segments() - before
+        # Not before the end: Zenoh's own records are the process's, and a later provider needs them too.
+        atexit.register(unlink_segments, mapped_segments() - before)
 
     @property
     def shared(self) -> bool:
@@ -84,7 +86,6 @@ class FrameBuffers:
     def close(self) -> None:
         """Give the shared memory back; readers that still hold a frame keep it until they let go."""
         self._provider = None
-        unlink_segments(self._segments)
 
 
 def _make_provider(size: int) -> shm.ShmProvider | None:

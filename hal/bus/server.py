@@ -73,8 +73,8 @@ class HalServer:
         self._closing = Event()
         self.failed = Event()
         """Set when a thread of the server died; the process should then stop the arm and end."""
-        before = existing_segments()
         self._buffers = FrameBuffers(camera.intrinsics, shared=config.shared_memory)
+        before = existing_segments()
         try:
             self._session = open_session(config, listen=True)
         except HalError:
@@ -150,9 +150,9 @@ class HalServer:
         complaint = _Complaint("the arm's state is not published")
         due_s = self._clock.now_s()
         while not self._closing.is_set():
+            self._status.put(encode(self._servo.status()))  # above all when the arm is silent
             try:
                 self._state.put(encode(self._servo.read_state()))
-                self._status.put(encode(self._servo.status()))
                 complaint.over()
             except HalError as error:
                 complaint.say(error)

@@ -10,9 +10,12 @@ from dataclasses import dataclass
 
 import zenoh
 
+from hal.bus.codec import MAX_BYTES
 from hal.errors import HalError, HalTimeoutError
 
 _LOG = logging.getLogger(__name__)
+_MAX_COMMAND_BYTES = 8 * 2**20
+"""Longest message the HAL process takes; the longest chunk (`hal.playback.MAX_POINTS`) has 1.2 MB."""
 _ROBOT = re.compile(r"[A-Za-z0-9_-]{1,40}")
 
 
@@ -105,13 +108,15 @@ def _zenoh_config(config: BusConfig, *, listen: bool) -> zenoh.Config:
         "connect": none if listen else {**ends, "timeout_ms": int(1e3 * config.connect_timeout_s)},
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
         "transport": {
+            # Zenoh would gather up to 1 GiB for whoever sends it.
+            "link": {"rx": {"max_message_size": _MAX_COMMAND_BYTES if listen else MAX_BYTES}},
             "shared_memory": {
                 "enabled": config.shared_memory,
                 # Frames are placed in shared memory by hand (hal/bus/frames.py). Zenoh's own pool would also catch
                 # queries, where restarts of the asking side leave segments behind.
                 "mode": "lazy",
                 "transport_optimization": {"enabled": False},
-            }
+            },
         },
     }
     return zenoh.Config.from_json5(json.dumps(settings))

@@ -35,6 +35,13 @@ def test_positions_end_at_the_joint_limits(edge: np.ndarray, side: float) -> Non
     assert allowed.q == pytest.approx(edge)
 
 
+def test_what_is_clipped_at_a_joint_limit_is_not_told_to_move_on() -> None:
+    wish = MIDDLE.copy()
+    wish[4] = Q_MAX[4] + 0.001
+    allowed = clip_setpoint(LIMITS, wish, ZERO + 1.0, wish, wish)
+    assert allowed.dq.tolist() == [1, 1, 1, 1, 0, 1, 1]
+
+
 @pytest.mark.parametrize("side", [-1.0, 1.0])
 def test_the_gripper_leads_its_measurement_by_the_grip_torque_at_most(side: float) -> None:
     wish = MIDDLE.copy()

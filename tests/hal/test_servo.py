@@ -11,6 +11,7 @@ from servo_bench import ARM, START, STEP, Bench, cruise, move, setpoint
 from hal.arm import ServoedArm
 from hal.errors import CommandRefusedError, HalTimeoutError, LeaseError, NotConnectedError, StoppedError
 from hal.messages import ServoMode, TrajectoryChunk
+from hal.playback import MAX_POINTS
 from hal.z1 import CONTROL_PERIOD_S, DDQ_MAX, DQ_MAX, KP, N_ARM, N_JOINTS, Q_MAX, Q_MIN
 
 HOLDING, TRACKING, BRAKING, STOPPED = ServoMode.HOLDING, ServoMode.TRACKING, ServoMode.BRAKING, ServoMode.STOPPED
@@ -202,6 +203,37 @@ def test_a_stop_clears_what_was_queued_even_when_it_is_lifted_before_the_next_ti
     assert not bench.servo.status().finished
 
 
+def test_a_stop_in_the_middle_of_a_tick_is_not_told_as_rest_before_the_arm_has_braked(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    bench = Bench()
+    bench.servo.stream(move())
+    bench.run(0.5)
+    send = bench.arm.send
+    monkeypatch.setattr(bench.arm, "send", lambda wish: (bench.servo.stop("the button"), send(wish))[1])
+    bench.run(CONTROL_PERIOD_S)
+    monkeypatch.undo()
+    assert (bench.mode, bench.reason) == (TRACKING, "the button")
+    bench.run_until_at_rest()
+    assert bench.mode is STOPPED
+
+
+def test_a_stop_while_a_single_setpoint_is_chased_brakes_and_latches() -> None:
+    bench = Bench()
+    goal = START.copy()
+    goal[0] += 2.0
+    bench.run(0.3, lambda: bench.servo.send(setpoint(goal)) and None)
+    bench.servo.stop("the button")
+    bench.run(CONTROL_PERIOD_S)
+    assert bench.mode is BRAKING
+    assert bench.run_until_at_rest() < 0.4
+    assert (bench.mode, bench.reason) == (STOPPED, "the button")
+    bench.servo.rearm()
+    held = bench.servo.status().q_command
+    bench.run(0.3)
+    assert bench.servo.status().q_command == pytest.approx(held, abs=1e-3)
+
+
 def test_a_stop_while_braking_goes_on_braking_and_latches() -> None:
     bench = Bench()
     bench.servo.stream(move(until_s=0.5))
@@ -345,6 +377,15 @@ def test_more_after_the_final_chunk_is_refused() -> None:
         bench.servo.stream(move(from_s=0.98))
 
 
+def test_more_than_can_be_checked_in_time_for_a_stop_is_refused() -> None:
+    long = np.arange(MAX_POINTS + 1) * CONTROL_PERIOD_S
+    still = np.tile(START, (len(long), 1))
+    bench = Bench()
+    with pytest.raises(CommandRefusedError, match=r"10001 points buffered; allowed are 10000.*in pieces"):
+        bench.servo.stream(TrajectoryChunk(trajectory_id=1, t_s=long, q=still, dq=0 * still))
+    bench.servo.stream(TrajectoryChunk(trajectory_id=1, t_s=long[:-1], q=still[:-1], dq=0 * still[:-1]))
+
+
 def test_a_stale_trajectory_is_refused() -> None:
     bench = Bench()
     bench.servo.stream(move(5))
@@ -410,6 +451,22 @@ def test_a_trajectory_replaced_in_motion_goes_over_without_a_jump() -> None:
     status = bench.servo.status()
     assert (status.trajectory_id, status.finished) == (2, True)
     assert status.q_command[ARM] == pytest.approx((here + back)[ARM], abs=1e-6)
+
+
+def test_a_trajectory_replaces_a_single_setpoint_for_good() -> None:
+    bench = Bench()
+    goal = START.copy()
+    goal[0] += 0.04
+    bench.servo.send(setpoint(goal))
+    bench.run(0.01)
+    here = bench.servo.status().q_command
+    still = TrajectoryChunk(
+        trajectory_id=1, t_s=np.array([0.0, 0.04]), q=np.array([here, here]), dq=np.zeros((2, 7)), final=True
+    )
+    bench.servo.stream(still)
+    bench.run(0.5)
+    assert bench.servo.status().finished
+    assert bench.servo.status().q_command == pytest.approx(here, abs=1e-6)
 
 
 # --- Lease ----------------------------------------------------------------------------------------------------------
@@ -577,6 +634,20 @@ def test_a_motion_with_a_held_object_starts_from_the_gripper_command(grip: str) 
     bench.run(1.2)
     assert bench.servo.status().finished
     assert KP[N_ARM] * (bench.servo.status().q_command - bench.arm.read_state().q)[N_ARM] > 2.9
+
+
+def test_a_latched_stop_and_its_end_are_told_once_each(caplog: pytest.LogCaptureFixture) -> None:
+    bench = Bench()
+    with caplog.at_level(logging.INFO, logger="hal.servo"):
+        bench.arm.inject_fault("overheat joint 2")
+        bench.run(0.1)
+        bench.arm.inject_fault()
+        bench.servo.rearm()
+        bench.run(0.1)
+    first, second = [record.getMessage() for record in caplog.records]
+    assert "the arm reports overheat joint 2" in first
+    assert "./z1 rearm" in first
+    assert "re-armed" in second
 
 
 def test_clipping_is_told_once_a_second(caplog: pytest.LogCaptureFixture) -> None:

@@ -146,6 +146,7 @@ def test_oversize_is_refused_before_it_is_looked_at():
         (_envelope({"type": "ArmSetpoint"}), "expected is"),
         (_envelope(["ArmSetpoint", {"q": [7], "dq": [2**62]}], bytes(56)), "shape"),
         (_envelope(["ArmSetpoint", {"q": [7], "dq": [-7]}], bytes(112)), "shape"),
+        (_envelope(["ArmSetpoint", {"q": [0, 2**26, 2**26, 2**26], "dq": [7]}], bytes(56)), "shape"),
         (_envelope(["ArmSetpoint", {"q": [7], "dq": [7]}], bytes(111)), "55 are there"),
         (_envelope(["ArmSetpoint", {"q": [7], "dq": [7]}], bytes(113)), "113 bytes"),
         (_envelope(["ArmSetpoint", {"q": [6], "dq": [7]}], bytes(104)), r"\(6,\)"),

@@ -13,8 +13,9 @@ from conftest import moving, slow_motion, wait_until
 from hal.arm import ServoedArm
 from hal.bus import keys
 from hal.bus.client import RemoteArm, RemoteCamera
-from hal.bus.codec import encode
+from hal.bus.codec import decode, encode
 from hal.bus.frames import FrameBuffers, FrameStamp
+from hal.bus.service import Listener, as_bytes
 from hal.bus.session import BusConfig, open_session
 from hal.bus.wire_errors import decode_error
 from hal.camera import Camera
@@ -27,7 +28,7 @@ from hal.errors import (
     NotConnectedError,
     StoppedError,
 )
-from hal.messages import ArmSetpoint, ServoMode, TrajectoryChunk
+from hal.messages import ArmSetpoint, ServoMode, ServoStatus, TrajectoryChunk
 from hal.z1 import Q_HOME
 
 HOME = np.append(Q_HOME, 0.0)
@@ -199,6 +200,17 @@ def test_an_arm_that_stops_measuring_makes_the_remote_state_too_old(hal, remote_
     wait_until(too_old)
 
 
+def test_the_status_of_an_arm_that_stops_measuring_is_still_published(hal, intruder):
+    newest: list[bytes] = []
+    listener = Listener(intruder, keys.STATUS, lambda sample: newest.append(as_bytes(sample.payload)))
+    hal.arm.freeze()
+    wait_until(lambda: newest and decode(newest[-1], ServoStatus).mode is ServoMode.STOPPED)
+    newest.clear()
+    wait_until(lambda: newest)
+    assert "state is lost" in decode(newest[-1], ServoStatus).reason
+    listener.close()
+
+
 def test_a_hal_that_goes_away_gives_typed_errors(hal, remote_arm):
     remote_arm.claim()
     hal.server.close()
@@ -364,6 +376,14 @@ def test_a_malformed_command_gets_one_clear_error_and_moves_nothing(hal, remote_
     status = hal.servo.status()
     assert status.mode is ServoMode.HOLDING
     np.testing.assert_array_equal(status.q_command, q)
+    assert not hal.server.failed.is_set()
+
+
+def test_a_command_too_long_to_be_one_is_not_even_gathered(hal, remote_arm, intruder):
+    replies = list(intruder.get(keys.CHUNK, payload=bytes(20 * 2**20), timeout=0.5))
+    assert all(reply.err.payload.to_bytes() == b"Timeout" for reply in replies)  # Zenoh's own, if anything
+    remote_arm.stop("still heard")
+    wait_until(lambda: hal.servo.status().mode is ServoMode.STOPPED)
     assert not hal.server.failed.is_set()
 
 

@@ -64,6 +64,27 @@ serve(make_rig(), BusConfig(port=int(sys.argv[1])), end, on_ready=lambda: print(
 print("ended", flush=True)
 """
 
+SERVE_TWICE = """
+import sys
+from threading import Event
+from hal.backends.mock_arm import make_rig
+from hal.bus.client import RemoteCamera
+from hal.bus.session import BusConfig
+from hal.process import serve
+
+def look():
+    with RemoteCamera(config) as camera:
+        camera.wait_for_frame(5.0)
+        print(camera.shared_memory)
+    end.set()
+
+config, end = BusConfig(port=int(sys.argv[1])), Event()
+end.set()
+serve(make_rig(), config, end)
+end.clear()
+serve(make_rig(), config, end, on_ready=look)
+"""
+
 
 def _start(code: str, *arguments: object) -> subprocess.Popen:
     return subprocess.Popen(
@@ -166,6 +187,15 @@ def test_frames_cross_in_shared_memory_of_which_nothing_is_left_once_both_proces
         assert [path for path in mapped if path.exists()] == []
     finally:
         _end(server, client)
+
+
+def test_the_second_server_of_a_process_shares_memory_as_the_first():
+    process = _start(SERVE_TWICE, free_config().port)
+    try:
+        output, errors = process.communicate(timeout=60)
+        assert (output, process.returncode) == ("True\n", 0), errors
+    finally:
+        _end(process)
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
