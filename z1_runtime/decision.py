@@ -16,7 +16,7 @@ from models.types import GraspGenerator, GraspSet
 from z1_runtime.config import RuntimeConfig
 from z1_runtime.kinematics import Kinematics
 from z1_runtime.perception import Perception
-from z1_runtime.planner import GraspPlanner
+from z1_runtime.planner import GraspPlanner, NoPlanError
 from z1_runtime.types import GraspPlan, Observation
 
 
@@ -83,6 +83,7 @@ class Decider:
         Raises:
             PerceptionError: nothing usable was seen.
             DegenerateCloudError: the object's cloud spans no box.
+            ValueError: the generator can make nothing of the cloud, such as an object wider than any opening.
             NoPlanError: no candidate can be executed; the message counts why.
         """
         config = self.config
@@ -99,6 +100,12 @@ class Decider:
                 up = T_base_camera[2, :3]  # the base's z axis, seen from the camera
                 box = fit_obb(observation.object_points, config.box_method, up=up)
                 ranked = rank_grasps(candidates, box, k=config.k_faces, alpha=config.alpha)
+            if not len(ranked):
+                raise NoPlanError(
+                    f"none of {len(candidates)} candidates comes at one of the {config.k_faces} nearest faces of the "
+                    "object's box; raise k_faces or n_candidates, or look from another side.",
+                    rejections=(),
+                )
             plan = self.planner.plan(ranked.grasps, observation, q, times.stage)  # ik, collision, plan
         return Decision(
             observation=observation, candidates=candidates, ranked=ranked, plan=plan, stage_ms=dict(times.ms)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -28,6 +29,8 @@ class ExecutorConfig:
     """Length of one message [s]."""
     poll_s: float = 0.02
     """How often the servo is asked how far it is [s]."""
+    stall_timeout_s: float = 1.0
+    """How long the servo may play nothing of a motion before it counts as lost [s]."""
     settle_dq: float = 0.02
     """Joint speed that counts as rest [rad/s]."""
     settle_timeout_s: float = 3.0
@@ -38,6 +41,9 @@ class ExecutorConfig:
             raise ValueError(
                 f"ExecutorConfig needs 0 < poll_s < chunk_s < lead_s; got {self.poll_s}, {self.chunk_s}, {self.lead_s}."
             )
+        for name in ("stall_timeout_s", "settle_dq", "settle_timeout_s"):
+            if not 0 < getattr(self, name) < np.inf:
+                raise ValueError(f"{name} is {getattr(self, name)}; it must be positive and finite.")
 
 
 Watcher = Callable[[ArmState, ServoStatus], None]
@@ -57,13 +63,14 @@ class Executor:
         """Play `trajectory` to its end; return when the servo has sent its last point.
 
         Raises:
+            InvalidMessageError: the trajectory holds values that are not finite; nothing moves.
             CommandRefusedError: the servo will not take it (stopped, wrong start, limits, lease).
-            MotionError: it was dropped on the way; the message carries the servo's reason.
+            MotionError: it was dropped on the way, with the servo's reason, or the servo plays it no longer.
         """
-        config = self._config
         trajectory_id = self._arm.status().trajectory_id + 1
-        pieces = list(trajectory.pieces(config.chunk_s))
-        sent_s = 0.0
+        chunks = _chunks(trajectory, trajectory_id, self._config.chunk_s)
+        sent_s, played_s = 0.0, 0.0
+        moved_s = self._clock.now_s()
         while True:
             status = self._look()
             ours = status.trajectory_id == trajectory_id
@@ -74,12 +81,15 @@ class Executor:
                     f"the motion was dropped {status.trajectory_time_s:.2f} s into {trajectory.duration_s:.2f} s: "
                     f"{status.reason}; the arm holds."
                 )
-            played_s = status.trajectory_time_s if ours else 0.0
-            while pieces and sent_s - played_s < config.lead_s:
-                piece = pieces.pop(0)
-                self._arm.stream(_chunk(trajectory, piece, trajectory_id, final=not pieces))
-                sent_s = float(trajectory.t_s[piece.stop - 1])
-            self._clock.sleep_until(self._clock.now_s() + config.poll_s)
+            if ours and status.trajectory_time_s > played_s:
+                played_s, moved_s = status.trajectory_time_s, self._clock.now_s()
+            elif self._clock.now_s() - moved_s > self._config.stall_timeout_s:
+                raise MotionError(_stalled(status, trajectory_id, played_s))
+            while chunks and sent_s - played_s < self._config.lead_s:
+                chunk = chunks.popleft()
+                self._arm.stream(chunk)
+                sent_s = float(chunk.t_s[-1])
+            self._clock.sleep_until(self._clock.now_s() + self._config.poll_s)
 
     def settle(self) -> ArmState:
         """Wait until no joint moves; return that state.
@@ -112,11 +122,26 @@ class Executor:
         return status
 
 
-def _chunk(trajectory: JointTrajectory, piece: slice, trajectory_id: int, *, final: bool) -> TrajectoryChunk:
-    return TrajectoryChunk(
-        trajectory_id=trajectory_id,
-        t_s=trajectory.t_s[piece],
-        q=trajectory.q[piece],
-        dq=trajectory.dq[piece],
-        final=final,
+def _chunks(trajectory: JointTrajectory, trajectory_id: int, length_s: float) -> deque[TrajectoryChunk]:
+    """Return all of `trajectory`, checked before any of it moves the arm."""
+    n = len(trajectory.t_s)
+    return deque(
+        TrajectoryChunk(
+            trajectory_id=trajectory_id,
+            t_s=trajectory.t_s[piece],
+            q=trajectory.q[piece],
+            dq=trajectory.dq[piece],
+            final=piece.stop == n,
+        )
+        for piece in trajectory.pieces(length_s)
+    )
+
+
+def _stalled(status: ServoStatus, trajectory_id: int, played_s: float) -> str:
+    where = f"after {played_s:.2f} s of it" if played_s > 0.0 else "before its start"
+    now = f"the servo is {status.mode.value}, at trajectory {status.trajectory_id}"
+    reason = f" ({status.reason})" if status.reason else ""
+    return (
+        f"motion {trajectory_id} stands still {where}: {now}{reason}. "
+        "The HAL was restarted, its ticks have ended, or another has taken the arm; see its log."
     )

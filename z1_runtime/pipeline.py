@@ -60,7 +60,7 @@ class PickPipeline:
         clock: the one both live by.
         inspector: where everything is shown.
         config: how a pick is done.
-        on_phase: called with each phase as it ends.
+        on_phase: called with each phase that ended well.
     """
 
     def __init__(
@@ -129,7 +129,6 @@ class PickPipeline:
 
     def _show(self, decision: Decision) -> None:
         observation, ranked = decision.observation, decision.ranked
-        self.inspector.log_frame(observation.frame, observation.T_base_camera)
         self.inspector.log_observation(observation)
         self.inspector.log_box(ranked.box, ranked.faces, observation.T_base_camera)
         self.inspector.log_candidates(ranked.grasps, observation.T_base_camera)
@@ -140,7 +139,11 @@ class PickPipeline:
     def _phase(self, name: str) -> Iterator[None]:
         start_s = self.clock.now_s()
         self.inspector.log_phase(name, start_s)
-        yield
+        try:
+            yield
+        except Exception:
+            self.inspector.log_phase(f"{name} failed", self.clock.now_s())
+            raise
         phase = Phase(name=name, start_s=start_s, duration_s=self.clock.now_s() - start_s)
         self._phases.append(phase)
         self.on_phase(phase)
