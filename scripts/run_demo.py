@@ -8,25 +8,26 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 from rich.console import Console
 
 from hal.bus.session import BusConfig
+from hal.clock import Stopwatch
+from hal.errors import HalError
 from hal.messages import ServoStatus
-from scripts.demo_robot import DemoRobot, HalProcess, lockstep_robot, remote_robot
+from scripts.hal_process import HalProcess
 from sim_twin.scene import SceneConfig
-from z1_runtime.assembly import make_decider
-from z1_runtime.config import load_config, save_config
-from z1_runtime.frame_tap import FrameTap
-from z1_runtime.inspect import Inspector
-from z1_runtime.pipeline import Phase, PickPipeline, PickRecord
+
+if TYPE_CHECKING:  # planner and viewer take seconds to load: that happens beside the HAL's own start
+    from scripts.demo_robot import DemoRobot
+    from sim_twin.truth import Truth
+    from z1_runtime.pipeline import Phase, PickPipeline, PickRecord
 
 LIFTED_M = 0.05
 """An object at least this much higher than before counts as lifted [m]."""
@@ -64,6 +65,9 @@ def main(config: Config) -> int:
     """Run one pick; 0 only if the object was lifted."""
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
     console = Console(highlight=False)
+    config.out.mkdir(parents=True, exist_ok=True)
+    for name in ("summary.json", "episode.rrd", "grasp.png"):  # a failed run leaves no old success behind
+        (config.out / name).unlink(missing_ok=True)
     scene = SceneConfig(
         object=config.object,
         distance_m=config.distance_m,
@@ -71,49 +75,89 @@ def main(config: Config) -> int:
         pitch_deg=config.pitch_deg,
         seed=config.seed,
     )
+    console.print(f"[bold]{config.object}[/] at {config.distance_m:.2f} m, {config.lateral_m:+.2f} m to the left")
+    summary = _identity(config)
+    try:
+        with ExitStack() as undo:
+            start = Stopwatch()
+            with console.status("starting the twin, loading the planner (some seconds)"):
+                process = None if config.lockstep else _start_hal(config, scene, undo)
+                robot, pipeline = _assemble(config, scene, process, console, undo)
+            console.print(f"  {'start':<9} {1e-3 * start.lap_ms():6.2f} s")
+            truth = _pick(robot, pipeline, process, summary)
+    except BaseException as error:
+        summary |= {"success": False, "error": str(error) or type(error).__name__}
+        raise
+    finally:
+        if "success" in summary:
+            (config.out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
+    from sim_twin.view import draw_picture
+
+    (config.out / "grasp.png").write_bytes(draw_picture(scene, truth.qpos))
+    _print_result(console, config, summary)
+    return 0 if summary["success"] else 1
+
+
+def _start_hal(config: Config, scene: SceneConfig, undo: ExitStack) -> HalProcess:
+    process = HalProcess(scene, config.bus, config.out / "hal.log")
+    undo.callback(process.end)
+    return process
+
+
+def _assemble(
+    config: Config, scene: SceneConfig, process: HalProcess | None, console: Console, undo: ExitStack
+) -> tuple[DemoRobot, PickPipeline]:
+    """Return the robot, claimed, and what will pick with it; `undo` takes them apart again."""
+    from scripts.demo_robot import lockstep_robot, remote_robot
+    from z1_runtime.assembly import make_decider
+    from z1_runtime.config import load_config, save_config
+    from z1_runtime.frame_tap import FrameTap
+    from z1_runtime.inspect import Inspector
+    from z1_runtime.pipeline import PickPipeline
+
     runtime = replace(load_config(config.config), seed=config.seed)
     if config.detector is not None:
         runtime = replace(runtime, detector=config.detector)
-    config.out.mkdir(parents=True, exist_ok=True)
-    summary_path = config.out / "summary.json"
-    summary_path.unlink(missing_ok=True)  # a failed run leaves no old success behind
     save_config(runtime, config.out / "config.yaml")
+    decider = make_decider(runtime)
+    decider.warm_up()
+    inspector = Inspector(config.out / "episode.rrd", live=config.view)
+    undo.callback(inspector.close)
+    robot = undo.enter_context(remote_robot(process, config.bus) if process else lockstep_robot(scene))
+    robot.arm.claim("demo")  # given back by its disconnecting, which forgives a HAL that is gone
+    if process:
+        undo.enter_context(FrameTap(robot.camera, robot.arm, inspector))
 
-    with ExitStack() as undo:
-        process = None
-        if not config.lockstep:
-            process = HalProcess(scene, config.bus, config.out / "hal.log")
-            undo.callback(process.end)
-        console.print(f"[bold]{config.object}[/] at {config.distance_m:.2f} m, {config.lateral_m:+.2f} m to the left")
-        decider = make_decider(runtime)
-        decider.warm_up()
-        robot = undo.enter_context(remote_robot(process, config.bus) if process else lockstep_robot(scene))
-        inspector = Inspector(config.out / "episode.rrd", live=config.view)
-        undo.callback(inspector.close)
-        pipeline = PickPipeline(
-            decider=decider,
-            arm=robot.arm,
-            camera=robot.camera,
-            clock=robot.clock,
-            inspector=inspector,
-            config=runtime,
-            on_phase=_phase_printer(console),
-        )
-        robot.arm.claim("demo")
-        undo.callback(robot.arm.release)
-        if process:
-            undo.enter_context(FrameTap(robot.camera, robot.arm, inspector))
-        summary = _identity(config)
-        try:
-            summary |= summarise(robot, pipeline.pick())
-        except Exception as err:
-            summary |= {"success": False, "error": str(err)}
-            raise
-        finally:
-            (config.out / "grasp.png").write_bytes(robot.picture())
-            summary_path.write_text(json.dumps(summary, indent=2) + "\n")
-    _print_result(console, config, summary)
-    return 0 if summary["success"] else 1
+    def say(phase: Phase) -> None:
+        console.print(f"  {phase.name:<9} {phase.duration_s:6.2f} s")
+
+    pipeline = PickPipeline(
+        decider=decider,
+        arm=robot.arm,
+        camera=robot.camera,
+        clock=robot.clock,
+        inspector=inspector,
+        config=runtime,
+        on_phase=say,
+    )
+    return robot, pipeline
+
+
+def _pick(robot: DemoRobot, pipeline: PickPipeline, process: HalProcess | None, summary: dict[str, Any]) -> Truth:
+    """Pick once, fill `summary`, and return the truth afterwards.
+
+    Raises:
+        HalError: as `PickPipeline.pick`; of a HAL process that has ended, its own last words.
+    """
+    try:
+        record = pipeline.pick()
+        truth = robot.truth()
+        summary |= summarise(robot, record, truth)
+    except HalError as error:
+        if process is not None and (ended := process.why_it_ended()):
+            raise HalError(ended) from error
+        raise
+    return truth
 
 
 def _identity(config: Config) -> dict[str, Any]:
@@ -127,9 +171,8 @@ def _identity(config: Config) -> dict[str, Any]:
     }
 
 
-def summarise(robot: DemoRobot, record: PickRecord) -> dict[str, Any]:
+def summarise(robot: DemoRobot, record: PickRecord, truth: Truth) -> dict[str, Any]:
     """Return what summary.json holds of a pick that was executed."""
-    truth = robot.truth()
     status = robot.arm.status()
     decision = record.decision
     return {
@@ -158,13 +201,6 @@ def _servo_figures(status: ServoStatus) -> dict[str, float]:
         "period_ms_p999": round(status.period_ms_p999, 4),
         "overruns": status.overruns,
     }
-
-
-def _phase_printer(console: Console) -> Callable[[Phase], None]:
-    def say(phase: Phase) -> None:
-        console.print(f"  {phase.name:<9} {phase.duration_s:6.2f} s")
-
-    return say
 
 
 def _print_result(console: Console, config: Config, summary: dict[str, Any]) -> None:

@@ -10,14 +10,14 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from threading import Event, Thread
 from typing import Annotated
 
 import tyro
 
-from hal.bus.session import BusConfig, open_session
+from hal.bus.session import BusConfig
 from hal.process import serve, stop_on_signals
 from hal.rig import RIGS, Rig
 
@@ -57,21 +57,16 @@ def main(config: Config) -> int:
     stop_on_signals(stop_event)
     if config.until_stdin_closes:
         Thread(target=_watch_stdin, args=(stop_event,), daemon=True).start()
-    evaluation: list[Callable[[], None]] = []
+    with ExitStack() as undo:
 
-    def ready() -> None:
-        if rig.world is not None:
-            from sim_twin.truth import TruthServer
+        def ready() -> None:
+            if rig.world is not None:
+                from sim_twin.truth import TruthServer
 
-            session = open_session(config.bus, listen=False)
-            evaluation.extend([TruthServer(session, rig.world).close, session.close])
-        print(READY, flush=True)
+                undo.callback(TruthServer(config.bus, rig.world).close)
+            print(READY, flush=True)
 
-    try:
         serve(rig, config.bus, stop_event, on_ready=ready)
-    finally:
-        for close in evaluation:
-            close()
     return 0
 
 

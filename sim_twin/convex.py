@@ -5,12 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
+from typing import TYPE_CHECKING
 
 import numpy as np
-import trimesh
-from scipy.spatial import ConvexHull
 
 from hal import z1
+
+if TYPE_CHECKING:  # trimesh takes two seconds to import: who only describes a scene goes without
+    import trimesh
 
 JAW_LINKS = ("gripperStator", "gripperMover")
 _PIVOT_IN_STATOR_M = 0.049  # URDF, jointGripper
@@ -67,8 +69,9 @@ def load_link_mesh(link: str) -> trimesh.Trimesh:
     Raises:
         FileNotFoundError: the wheel with the description is not installed.
     """
-    stem = link[0].upper() + link[1:] if link.startswith(("link", "gripper")) else link
-    return trimesh.load_mesh(z1.mesh_dir() / "collision" / f"z1_{stem}.STL")
+    import trimesh
+
+    return trimesh.load_mesh(z1.mesh_dir() / "collision" / f"z1_{link[0].upper()}{link[1:]}.STL")
 
 
 @cache
@@ -91,6 +94,8 @@ def split_convex(link: str) -> tuple[np.ndarray, ...]:
 
 def _clip(mesh: trimesh.Trimesh, region: Region) -> np.ndarray:
     """Return points (M, 3) of the surface inside the region, with those where it meets the region's planes."""
+    import trimesh
+
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
     for axis, (low, high) in enumerate((region.x, region.y, region.z)):
         for bound, sign in ((low, 1.0), (high, -1.0)):
@@ -105,5 +110,7 @@ def _clip(mesh: trimesh.Trimesh, region: Region) -> np.ndarray:
 
 
 def _hull_corners(points: np.ndarray, grid_m: float) -> np.ndarray:
+    from scipy.spatial import ConvexHull
+
     coarse = np.unique(np.round(points / grid_m).astype(np.int64), axis=0) * grid_m
     return coarse[ConvexHull(coarse).vertices]

@@ -84,21 +84,14 @@ _BOTTLE_PROFILE = (
 _PET, _LABEL, _CAP = (0.42, 0.66, 0.80, 1.0), (0.90, 0.92, 0.95, 1.0), (0.10, 0.28, 0.62, 1.0)
 
 OBJECTS: dict[str, GraspObject] = {
-    # A half-litre bottle, half full: 25 g of PET and 275 g of water that stands below 120 mm. The water is taken as
-    # frozen in place: at grasping accelerations its free surface moves the centre of mass by a few millimetres.
+    # A half-litre bottle, half full: 25 g of PET and 275 g of water, which stands 80 mm high (its share of the label's
+    # part is spread over that part). The water is taken as frozen in place: at grasping accelerations its free surface
+    # moves the centre of mass by a few millimetres.
     "bottle": GraspObject(
         height_m=0.200,
         parts=_lathe(
-            (
-                (0.0, 0.030),
-                (0.004, 0.033),
-                (0.060, 0.033),
-                (0.120, 0.033),
-                (0.150, 0.033),
-                (0.178, 0.013),
-                (0.200, 0.013),
-            ),
-            ((0.009, _PET), (0.137, _PET), (0.140, _LABEL), (0.006, _PET), (0.004, _PET), (0.004, _CAP)),
+            _BOTTLE_PROFILE,
+            ((0.014, _PET), (0.199, _PET), (0.076, _LABEL), (0.005, _PET), (0.003, _PET), (0.003, _CAP)),
         ),
     ),
     # A pack of biscuits: card, 0.6 kg/l. Three different edges, so that no two faces can be mixed up. The 40 mm edge

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import mujoco
 import numpy as np
 
@@ -12,12 +14,19 @@ from sim_twin.z1_mjcf import GROUP_ARM, GROUP_SCENE
 _SKY = np.array([205, 214, 224], np.uint8)
 _TO_LIGHT = np.array([-0.28, -0.56, 0.78])
 _AMBIENT, _DIFFUSE = 0.55, 0.45
+_FAR_M = 20.0
 
 
-class RayRenderer:
-    """Casts every pixel's ray through MuJoCo's bounding-volume trees."""
+class RayCaster:
+    """Casts every pixel's ray through MuJoCo's bounding-volume trees.
 
-    def __init__(self, model: mujoco.MjModel, intrinsics: Intrinsics) -> None:
+    Args:
+        model: the scene.
+        intrinsics: of the camera.
+        groups: the geom groups that it sees.
+    """
+
+    def __init__(self, model: mujoco.MjModel, intrinsics: Intrinsics, groups: Sequence[int]) -> None:
         i = intrinsics
         self._model, self._size = model, (i.height, i.width)
         u, v = np.meshgrid(np.arange(i.width), np.arange(i.height))
@@ -25,31 +34,50 @@ class RayRenderer:
         self._lengths = np.linalg.norm(rays, axis=1)
         self._rays = rays / self._lengths[:, None]
         self._groups = np.zeros(mujoco.mjNGROUP, np.uint8)
-        self._groups[[GROUP_SCENE, GROUP_ARM]] = 1
-        self._is_object = np.append(object_geoms(model), False)  # geom −1: nothing hit
+        self._groups[list(groups)] = 1
         rgba = np.where(model.geom_matid[:, None] >= 0, model.mat_rgba[model.geom_matid], model.geom_rgba)
         self._rgb = 255.0 * rgba[:, :3]
 
-    def render(self, data: mujoco.MjData) -> View:
-        """Draw the state `data` (kinematics computed)."""
-        camera, n = camera_id(self._model), len(self._rays)
-        R_base_gl = data.cam_xmat[camera].reshape(3, 3)
-        R_base_camera = R_base_gl * [1.0, -1.0, -1.0]  # OpenGL's camera looks along −z with y up
-        rays = self._rays @ R_base_camera.T
+    def cast(self, data: mujoco.MjData, T_base_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return what is seen from `T_base_camera` (4, 4), optical axes, of the state `data` (kinematics computed).
+
+        Returns:
+            Colour (H, W, 3) uint8, distance along the optical axis (H, W) float32 [m] (0 where nothing is hit), and
+            the numbers (H, W) of the geoms (−1 where nothing is hit).
+        """
+        n, rays = len(self._rays), self._rays @ T_base_camera[:3, :3].T
         geoms, ranges, normals = np.empty(n, np.int32), np.empty(n), np.zeros((n, 3))
-        origin = data.cam_xpos[camera].copy()
+        origin = T_base_camera[:3, 3].copy()
         mujoco.mj_multiRay(
-            self._model, data, origin, rays.ravel(), self._groups, True, -1, geoms, ranges, normals.ravel(), n, 20.0
+            self._model, data, origin, rays.ravel(), self._groups, True, -1, geoms, ranges, normals.ravel(), n, _FAR_M
         )
         hit = geoms >= 0
         z_m = np.where(hit, ranges / self._lengths, 0.0).astype(np.float32)
         light = _AMBIENT + _DIFFUSE * np.clip(normals @ _TO_LIGHT, 0.0, 1.0)
         colour = np.where(hit[:, None], self._rgb[geoms] * light[:, None], _SKY)
-        return View(
-            colour=np.clip(colour, 0, 255).astype(np.uint8).reshape(*self._size, 3),
-            z_m=z_m.reshape(self._size),
-            mask=self._is_object[geoms].reshape(self._size),
+        return (
+            np.clip(colour, 0, 255).astype(np.uint8).reshape(*self._size, 3),
+            z_m.reshape(self._size),
+            geoms.reshape(self._size),
         )
+
+
+class RayRenderer:
+    """The wrist camera by rays."""
+
+    def __init__(self, model: mujoco.MjModel, intrinsics: Intrinsics) -> None:
+        self._caster = RayCaster(model, intrinsics, (GROUP_SCENE, GROUP_ARM))
+        self._camera = camera_id(model)
+        self._is_object = np.append(object_geoms(model), False)  # geom −1: nothing hit
+
+    def render(self, data: mujoco.MjData) -> View:
+        """Draw the state `data` (kinematics computed)."""
+        T_base_camera = np.eye(4)
+        # OpenGL's camera looks along −z with y up.
+        T_base_camera[:3, :3] = data.cam_xmat[self._camera].reshape(3, 3) * [1.0, -1.0, -1.0]
+        T_base_camera[:3, 3] = data.cam_xpos[self._camera]
+        colour, z_m, geoms = self._caster.cast(data, T_base_camera)
+        return View(colour=colour, z_m=z_m, mask=self._is_object[geoms])
 
     def close(self) -> None:
         """Nothing is held."""

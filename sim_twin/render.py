@@ -5,9 +5,7 @@ Two ways: OpenGL through EGL, or, where there is none, ray casting.
 
 from __future__ import annotations
 
-import logging
 import os
-import threading
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -15,20 +13,12 @@ import mujoco
 import numba
 import numpy as np
 
-from hal.errors import CameraError
 from hal.messages import Intrinsics
+from sim_twin.gl import Canvas, choose
 from sim_twin.objects import OBJECT_BODY
 from sim_twin.z1_mjcf import GROUP_ARM, GROUP_SCENE
 
-logger = logging.getLogger(__name__)
-
-RENDER_VARIABLE = "Z1_TWIN_RENDER"
-"""Environment variable that forces `egl` or `rays`; unset or `auto` takes the first that works."""
-RENDERERS = ("auto", "egl", "rays")
-
 _NEAR_M, _FAR_M = 0.01, 20.0
-_warned = False
-_context_lock = threading.Lock()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,28 +51,15 @@ def make_renderer(model: mujoco.MjModel, intrinsics: Intrinsics, kind: str | Non
     Args:
         model: the scene.
         intrinsics: of the wrist camera.
-        kind: one of `RENDERERS`; by default what the environment variable says.
+        kind: one of `sim_twin.gl.RENDERERS`; by default what the environment variable says.
 
     Raises:
         ValueError: no such kind.
         CameraError: EGL was asked for and there is none.
     """
-    global _warned  # noqa: PLW0603 - one warning per process
-    kind = kind or os.environ.get(RENDER_VARIABLE, "auto")
-    if kind not in RENDERERS:
-        raise ValueError(f"renderer is {kind!r}; set {RENDER_VARIABLE} to one of: {', '.join(RENDERERS)}.")
-    if kind != "rays":
-        try:
-            return EglRenderer(model, intrinsics)
-        except (ImportError, AttributeError, RuntimeError) as error:
-            if kind == "egl":
-                raise CameraError(f"no OpenGL through EGL here ({error}); install libegl1 or unset it.") from error
-            if not _warned:
-                _warned = True
-                logger.warning("No OpenGL through EGL (%s): the twin's camera casts rays, with flat colours.", error)
     from sim_twin.rays import RayRenderer
 
-    return RayRenderer(model, intrinsics)
+    return choose(kind, lambda: EglRenderer(model, intrinsics), lambda: RayRenderer(model, intrinsics))
 
 
 def camera_id(model: mujoco.MjModel) -> int:
@@ -99,16 +76,12 @@ class EglRenderer:
     """Two passes on one framebuffer of the camera's size: geom numbers with depth, then colour."""
 
     def __init__(self, model: mujoco.MjModel, intrinsics: Intrinsics) -> None:
-        # Software GL would take every core for itself; one leaves the others to the servo. Read when GL is loaded.
-        os.environ.setdefault("LP_NUM_THREADS", "1")
-        from mujoco.egl import GLContext
-
         self._model, self._intrinsics = model, intrinsics
         width, height = intrinsics.width, intrinsics.height
-        self._gl = GLContext(width, height)
-        self._gl.make_current()
-        self._context = make_context(model, width, height, samples=0)
-        self._context.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR.value
+        # Software GL would take every core for itself; one leaves the others to the servo. Read when GL is loaded.
+        os.environ.setdefault("LP_NUM_THREADS", "1")
+        self._canvas = Canvas(model, width, height)
+        self._canvas.context.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR.value
         self._scene = mujoco.MjvScene(model, maxgeom=500)
         self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = False
         self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
@@ -118,28 +91,23 @@ class EglRenderer:
         self._camera = mujoco.MjvCamera()
         self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED.value
         self._camera.fixedcamid = camera_id(model)
-        self._rect = mujoco.MjrRect(0, 0, width, height)
         self._is_object = object_geoms(model)
         self._ids = np.empty((height, width, 3), np.uint8)
         self._inverse_z = np.empty((height, width), np.float32)
 
     def render(self, data: mujoco.MjData) -> View:
         """Draw the state `data` (kinematics computed)."""
-        self._gl.make_current()
         category = mujoco.mjtCatBit.mjCAT_ALL.value
         mujoco.mjv_updateScene(self._model, data, self._option, None, self._camera, category, self._scene)
         self._set_frustum()
         z_m, mask = self._draw_depth_and_mask()
         colour = np.empty_like(self._ids)
-        mujoco.mjr_render(self._rect, self._scene, self._context)
-        mujoco.mjr_readPixels(colour, None, self._rect, self._context)
+        self._canvas.draw(self._scene, colour)
         return View(colour=np.ascontiguousarray(colour[::-1]), z_m=z_m, mask=mask)
 
     def close(self) -> None:
         """Free the context."""
-        self._gl.make_current()
-        self._context.free()
-        self._gl.free()
+        self._canvas.close()
 
     def _set_frustum(self) -> None:
         """Give OpenGL the pinhole: pixel centres are at whole numbers here and at halves there."""
@@ -155,9 +123,8 @@ class EglRenderer:
     def _draw_depth_and_mask(self) -> tuple[np.ndarray, np.ndarray]:
         by_number = [int(mujoco.mjtRndFlag.mjRND_SEGMENT), int(mujoco.mjtRndFlag.mjRND_IDCOLOR)]
         self._scene.flags[by_number] = True
-        mujoco.mjr_render(self._rect, self._scene, self._context)
+        self._canvas.draw(self._scene, self._ids, self._inverse_z)
         self._scene.flags[by_number] = False
-        mujoco.mjr_readPixels(self._ids, self._inverse_z, self._rect, self._context)
         is_object = np.zeros(self._scene.ngeom + 1, np.bool_)
         for geom in self._scene.geoms[: self._scene.ngeom]:
             if geom.segid >= 0 and geom.objtype == mujoco.mjtObj.mjOBJ_GEOM:
@@ -181,14 +148,3 @@ def _decode(ids: np.ndarray, inverse_z: np.ndarray, is_object: np.ndarray) -> tu
                 z_m[v, u] = _NEAR_M * _FAR_M / (_NEAR_M + inverse_z[row, u] * (_FAR_M - _NEAR_M))
             mask[v, u] = is_object[ids[row, u, 0] + 256 * ids[row, u, 1]]
     return z_m, mask
-
-
-def make_context(model: mujoco.MjModel, width: int, height: int, samples: int) -> mujoco.MjrContext:
-    """Return a drawing context whose offscreen buffer is exactly (height, width); a GL context must be current."""
-    with _context_lock:  # the size travels in the model, which several threads may share
-        sizes = model.vis.global_
-        sizes.offwidth, sizes.offheight = width, height
-        model.vis.quality.offsamples = samples
-        context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
-    mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, context)
-    return context

@@ -97,7 +97,7 @@ def _set_options(spec: mujoco.MjSpec) -> None:
     spec.visual.map.znear, spec.visual.map.zfar = 0.01, 20.0
     spec.visual.headlight.ambient, spec.visual.headlight.diffuse = [0.30, 0.30, 0.32], [0.25, 0.25, 0.25]
     spec.visual.headlight.specular = [0.0, 0.0, 0.0]
-    spec.visual.quality.shadowsize, spec.visual.map.shadowclip = 4096, 1.4
+    spec.visual.quality.shadowsize, spec.visual.map.shadowclip = 2048, 1.0
 
 
 def _add_surroundings(spec: mujoco.MjSpec) -> None:

@@ -1,26 +1,29 @@
-"""What only the twin knows, over Zenoh and for evaluation alone: where the object is, how the scene looks."""
+"""What only the twin knows, over Zenoh and for evaluation alone: where everything really is."""
 
 from __future__ import annotations
 
-import io
-from dataclasses import dataclass
+import atexit
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Self
 
 import msgpack
 import numpy as np
-import zenoh
-from PIL import Image
 
+from hal.bus.link import Link
+from hal.bus.service import Service
 from hal.bus.session import BusConfig, open_session
+from hal.clock import WallClock
 from hal.errors import HalTimeoutError
-from sim_twin.world import World
+
+if TYPE_CHECKING:
+    from sim_twin.world import World
 
 _TRUTH = "eval/truth"
-_PICTURE = "eval/picture"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Truth:
-    """The object as it really is."""
+    """The scene as it really is."""
 
     object: str
     """Its name."""
@@ -28,43 +31,58 @@ class Truth:
     """(4, 4) its pose."""
     lifted_m: float
     """How much higher its lowest point is than at the start [m]."""
+    qpos: np.ndarray
+    """(14,) MuJoCo's positions: joints [rad], then the object's position [m] and quaternion (wxyz)."""
 
 
 def read_truth(world: World) -> Truth:
     """Return the truth about `world` at this moment."""
-    return Truth(object=world.config.object, T_base_object=world.T_base_object(), lifted_m=world.lifted_m())
+    return Truth(
+        object=world.config.object,
+        T_base_object=world.T_base_object(),
+        lifted_m=world.lifted_m(),
+        qpos=world.snapshot().qpos.copy(),
+    )
 
 
 class TruthServer:
-    """Answers questions about a world, beside its HAL process."""
+    """Answers questions about a world, beside its HAL process, whose link must be open.
 
-    def __init__(self, session: zenoh.Session, world: World) -> None:
+    Pictures are left to the asker: drawing one here would take the interpreter from the servo.
+    """
+
+    def __init__(self, config: BusConfig, world: World) -> None:
         self._world = world
-        # Each queryable's callback has a thread of its own, so a slow picture holds up nobody.
-        self._queryables = [
-            session.declare_queryable(_TRUTH, self._answer_truth),
-            session.declare_queryable(_PICTURE, self._answer_picture),
-        ]
+        self._session = open_session(config, listen=False)
+        self._service = Service(self._session, _TRUTH, self._answer, on_death=lambda: None)
+        atexit.register(self.close)  # a program that ends carelessly leaves no thread inside Zenoh
 
     def close(self) -> None:
         """Answer no more."""
-        for queryable in self._queryables:
-            queryable.undeclare()
+        atexit.unregister(self.close)
+        self._service.close()
+        self._session.close()
 
-    def _answer_truth(self, query: zenoh.Query) -> None:
+    def _answer(self, asker: str, payload: bytes) -> bytes:
         truth = read_truth(self._world)
-        payload = {"object": truth.object, "T": truth.T_base_object.ravel().tolist(), "lifted_m": truth.lifted_m}
-        query.reply(query.key_expr, msgpack.packb(payload))
-
-    def _answer_picture(self, query: zenoh.Query) -> None:
-        query.reply(query.key_expr, png(self._world.render_view(1280, 720)))
+        content = {
+            "object": truth.object,
+            "T_base_object": truth.T_base_object.ravel().tolist(),
+            "lifted_m": truth.lifted_m,
+            "qpos": truth.qpos.tolist(),
+        }
+        return msgpack.packb(content)  # pyright: ignore[reportReturnType] (its stub is wrong)
 
 
 class TruthClient:
-    """Asks a twin's HAL process."""
+    """Asks a twin's HAL process.
+
+    Raises:
+        HalTimeoutError: no HAL process answers.
+    """
 
     def __init__(self, config: BusConfig) -> None:
-        self._session = open_session(config, listen=False)
+        self._link = Link(replace(config, request_timeout_s=2.0), WallClock(), "the twin's truth")
 
     def truth(self) -> Truth:
         """Return the truth at this moment.
@@ -72,31 +90,21 @@ class TruthClient:
         Raises:
             HalTimeoutError: no twin answers, for instance because the HAL drives a real arm.
         """
-        data = msgpack.unpackb(self._ask(_TRUTH, timeout_s=2.0))
-        T_base_object = np.array(data["T"]).reshape(4, 4)
-        return Truth(object=data["object"], T_base_object=T_base_object, lifted_m=data["lifted_m"])
-
-    def picture(self) -> bytes:
-        """Return a picture of the scene as PNG.
-
-        Raises:
-            HalTimeoutError: as `truth`.
-        """
-        return self._ask(_PICTURE, timeout_s=20.0)
+        try:
+            content = msgpack.unpackb(self._link.ask(_TRUTH))
+        except HalTimeoutError as error:
+            raise HalTimeoutError(
+                f"the twin does not answer; only a simulated HAL knows the truth ({error})"
+            ) from error
+        T_base_object, qpos = np.array(content.pop("T_base_object")).reshape(4, 4), np.array(content.pop("qpos"))
+        return Truth(T_base_object=T_base_object, qpos=qpos, **content)
 
     def close(self) -> None:
         """Hang up."""
-        self._session.close()
+        self._link.close()
 
-    def _ask(self, key: str, timeout_s: float) -> bytes:
-        for reply in self._session.get(key, timeout=timeout_s):
-            if reply.ok is not None:
-                return reply.ok.payload.to_bytes()
-        raise HalTimeoutError(f"no twin answered {key!r} within {timeout_s} s; only a simulated HAL knows the truth.")
+    def __enter__(self) -> Self:
+        return self
 
-
-def png(image: np.ndarray) -> bytes:
-    """Return an (H, W, 3) uint8 RGB image as the bytes of a PNG file."""
-    file = io.BytesIO()
-    Image.fromarray(image).save(file, format="PNG", optimize=True)
-    return file.getvalue()
+    def __exit__(self, *_: object) -> None:
+        self.close()

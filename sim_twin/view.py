@@ -2,58 +2,101 @@
 
 from __future__ import annotations
 
+import io
+
 import mujoco
 import numpy as np
+from PIL import Image
 
-from hal.errors import CameraError
-from sim_twin.render import make_context
+from hal.messages import Intrinsics
+from sim_twin.gl import Canvas, choose
+from sim_twin.rays import RayCaster
+from sim_twin.scene import SceneConfig, build_model
 from sim_twin.z1_mjcf import GROUP_MOUNT, GROUP_SCENE, GROUP_VISUAL
 
-_LOOK_AT_M = (0.25, 0.0, 0.19)
-_DISTANCE_M = 0.90
+_SEEN = (GROUP_SCENE, GROUP_VISUAL, GROUP_MOUNT)
+_LOOK_AT_M = np.array([0.25, 0.0, 0.21])
+_DISTANCE_M = 0.80
 _AZIMUTH_DEG, _ELEVATION_DEG = 122.0, -14.0
-_SAMPLES = 8
+_PASSES = 8
+_SUN_RADIUS = 0.03
+"""Half width of the sun as seen from the table, as a slope: pictures with suns all over it add up to soft shadows."""
 
 
-class OutsideView:
-    """A fixed camera beside the table; belongs to the thread that made it.
+def draw_picture(config: SceneConfig, qpos: np.ndarray, width: int = 1280, height: int = 720) -> bytes:
+    """Return a PNG file of the scene `config` with MuJoCo's positions `qpos` (nq,)."""
+    model = build_model(config)
+    data = mujoco.MjData(model)
+    data.qpos[:] = qpos
+    mujoco.mj_forward(model, data)
+    file = io.BytesIO()
+    Image.fromarray(draw_outside(model, data, width, height)).save(file, format="PNG", optimize=True)
+    return file.getvalue()
 
-    Raises:
-        CameraError: there is no OpenGL through EGL.
+
+def draw_outside(
+    model: mujoco.MjModel, data: mujoco.MjData, width: int, height: int, kind: str | None = None
+) -> np.ndarray:
+    """Return a picture (height, width, 3) uint8, from beside the table, of the state `data` (kinematics computed).
+
+    Args:
+        model: the scene.
+        data: its state.
+        width: [px].
+        height: [px].
+        kind: one of `sim_twin.gl.RENDERERS`; by default what the environment variable says.
     """
+    return choose(
+        kind, lambda: _draw_with_gl(model, data, width, height), lambda: _draw_with_rays(model, data, width, height)
+    )
 
-    def __init__(self, model: mujoco.MjModel, width: int, height: int) -> None:
-        try:
-            from mujoco.egl import GLContext
 
-            self._gl = GLContext(width, height)
-        except (ImportError, AttributeError, RuntimeError) as error:
-            raise CameraError(f"pictures from outside need OpenGL through EGL ({error}); install libegl1.") from error
-        self._gl.make_current()
-        self._model = model
-        self._context = make_context(model, width, height, samples=_SAMPLES)
-        self._scene = mujoco.MjvScene(model, maxgeom=500)
-        self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION.value] = False
-        self._option = mujoco.MjvOption()
-        self._option.geomgroup[:] = 0
-        self._option.geomgroup[[GROUP_SCENE, GROUP_VISUAL, GROUP_MOUNT]] = 1
-        self._camera = mujoco.MjvCamera()
-        self._camera.lookat[:] = _LOOK_AT_M
-        self._camera.distance, self._camera.azimuth, self._camera.elevation = _DISTANCE_M, _AZIMUTH_DEG, _ELEVATION_DEG
-        self._rect = mujoco.MjrRect(0, 0, width, height)
+def _draw_with_gl(model: mujoco.MjModel, data: mujoco.MjData, width: int, height: int) -> np.ndarray:
+    canvas = Canvas(model, width, height)
+    scene, option, camera = mujoco.MjvScene(model, maxgeom=500), mujoco.MjvOption(), mujoco.MjvCamera()
+    scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION.value] = False
+    option.geomgroup[:] = 0
+    option.geomgroup[list(_SEEN)] = 1
+    camera.lookat[:] = _LOOK_AT_M
+    camera.distance, camera.azimuth, camera.elevation = _DISTANCE_M, _AZIMUTH_DEG, _ELEVATION_DEG
+    total, colour = np.zeros((height, width, 3), np.uint16), np.empty((height, width, 3), np.uint8)
+    try:
+        for offset in _spread(_PASSES):
+            mujoco.mjv_updateScene(model, data, option, None, camera, mujoco.mjtCatBit.mjCAT_ALL.value, scene)
+            _shift(scene, offset, height)
+            canvas.draw(scene, colour)
+            total += colour
+    finally:
+        canvas.close()
+    return np.ascontiguousarray((total // _PASSES).astype(np.uint8)[::-1])
 
-    def render(self, data: mujoco.MjData) -> np.ndarray:
-        """Return a picture (height, width, 3) uint8 of the state `data` (kinematics computed)."""
-        self._gl.make_current()
-        category = mujoco.mjtCatBit.mjCAT_ALL.value
-        mujoco.mjv_updateScene(self._model, data, self._option, None, self._camera, category, self._scene)
-        mujoco.mjr_render(self._rect, self._scene, self._context)
-        colour = np.empty((self._rect.height, self._rect.width, 3), np.uint8)
-        mujoco.mjr_readPixels(colour, None, self._rect, self._context)
-        return np.ascontiguousarray(colour[::-1])
 
-    def close(self) -> None:
-        """Free the context."""
-        self._gl.make_current()
-        self._context.free()
-        self._gl.free()
+def _spread(n: int) -> np.ndarray:
+    """Return points (n, 2) that fill [−1, 1]² evenly: the R2 sequence (Roberts 2018)."""
+    plastic = 1.32471795724474602596
+    return 2.0 * ((0.5 + np.outer(np.arange(1, n + 1), [1 / plastic, 1 / plastic**2])) % 1.0) - 1.0
+
+
+def _shift(scene: mujoco.MjvScene, offset: np.ndarray, height: int) -> None:
+    """Move the picture by a part of a pixel, which smooths edges, and the sun over its disc, which softens shadows."""
+    for camera in scene.camera:
+        pixel_m = (camera.frustum_top - camera.frustum_bottom) / height
+        camera.frustum_center += 0.5 * pixel_m * offset[0]
+        camera.frustum_top += 0.5 * pixel_m * offset[1]
+        camera.frustum_bottom += 0.5 * pixel_m * offset[1]
+    for light in scene.lights[: scene.nlight]:
+        if not light.headlight:
+            light.dir[:2] += _SUN_RADIUS * offset
+            light.ambient[:], light.diffuse[:] = 0.16, 0.50
+
+
+def _draw_with_rays(model: mujoco.MjModel, data: mujoco.MjData, width: int, height: int) -> np.ndarray:
+    focal = height / 2 / np.tan(np.deg2rad(model.vis.global_.fovy) / 2)
+    intrinsics = Intrinsics(width=width, height=height, fx=focal, fy=focal, cx=(width - 1) / 2, cy=(height - 1) / 2)
+    azimuth, elevation = np.deg2rad([_AZIMUTH_DEG, _ELEVATION_DEG])
+    forward = np.array([*(np.cos(elevation) * np.array([np.cos(azimuth), np.sin(azimuth)])), np.sin(elevation)])
+    right = np.array([np.sin(azimuth), -np.cos(azimuth), 0.0])
+    T_base_camera = np.eye(4)
+    T_base_camera[:3, :3] = np.column_stack([right, np.cross(forward, right), forward])
+    T_base_camera[:3, 3] = _LOOK_AT_M - _DISTANCE_M * forward
+    return RayCaster(model, intrinsics, _SEEN).cast(data, T_base_camera)[0]

@@ -103,16 +103,6 @@ class World:
         mujoco.mj_camlight(self.model, copy)
         return copy
 
-    def render_view(self, width: int, height: int) -> np.ndarray:
-        """Return a picture (height, width, 3) uint8 of the whole scene from outside, for people."""
-        from sim_twin.view import OutsideView
-
-        view = OutsideView(self.model, width, height)
-        try:
-            return view.render(self.snapshot())
-        finally:
-            view.close()
-
     def _lowest_m(self) -> float:
         pose = self.T_base_object()
         return float((self._corners @ pose[2, :3]).min() + pose[2, 3])

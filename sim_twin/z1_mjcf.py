@@ -126,7 +126,7 @@ def _add_servo(spec: mujoco.MjSpec, index: int) -> None:
 def _add_geoms(spec: mujoco.MjSpec, body: mujoco.MjsBody, name: str) -> None:
     vertices, faces = load_visual_mesh(name)
     jaw = name in JAW_LINKS
-    rgba = _LINK_RGBA["jaw" if jaw else "dark" if name in ("link00", "link04", "link06") else "link"]
+    colour = "jaw" if jaw else "dark" if name in ("link00", "link04", "link06") else "link"
     visual = spec.add_mesh(name=f"{name}_visual", inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL)
     visual.uservert, visual.userface = vertices.ravel(), faces.ravel()
     body.add_geom(
@@ -136,7 +136,7 @@ def _add_geoms(spec: mujoco.MjSpec, body: mujoco.MjsBody, name: str) -> None:
         group=GROUP_VISUAL,
         contype=0,
         conaffinity=0,
-        material="jaw" if jaw else "dark" if rgba == _LINK_RGBA["dark"] else "link",
+        material=colour,
     )
     hand = jaw or name in ("link05", "link06")
     for number, corners in enumerate(split_convex(name)):
@@ -154,7 +154,7 @@ def _add_geoms(spec: mujoco.MjSpec, body: mujoco.MjsBody, name: str) -> None:
             friction=JAW_FRICTION if jaw else (0.3, 0.005, 0.0001),
             solref=CONTACT_SOLREF,
             solimp=CONTACT_SOLIMP,
-            rgba=rgba,
+            rgba=_LINK_RGBA[colour],
         )
 
 
@@ -183,8 +183,8 @@ def _add_mount(flange: mujoco.MjsBody) -> None:
         material="camera",
         **common,
     )
-    # A plate from the flange's skin (radius 32.5 mm) up to the back of the housing.
-    foot, head = np.array([0.020, 0.030, 0.009]), pose[:3, :3] @ [0.009, 0.0, -0.0200] + pose[:3, 3]
+    # A printed plate of 8 mm, 36 g with its screws 40, from the flange's skin (radius 32.5 mm) to the housing's back.
+    foot, head = np.array([0.020, 0.030, 0.009]), pose[:3, :3] @ [0.009, 0.0, -0.0220] + pose[:3, 3]
     middle, along = (foot + head) / 2, head - foot
     angle = np.arctan2(-along[0], along[1])
     bracket = flange.add_body(
@@ -192,7 +192,7 @@ def _add_mount(flange: mujoco.MjsBody) -> None:
     )
     bracket.add_geom(
         name="camera_bracket",
-        size=[0.0015, np.linalg.norm(along) / 2, 0.015],
+        size=[0.004, np.linalg.norm(along) / 2, 0.015],
         mass=_BRACKET_MASS_KG,
         material="bracket",
         **common,

@@ -31,4 +31,4 @@ def test_the_compiled_inertia_is_that_of_a_solid_cylinder() -> None:
 def test_the_water_pulls_the_bottles_centre_of_mass_below_its_middle() -> None:
     model = World(SceneConfig(object="bottle")).model
     assert model.body("object").mass[0] == pytest.approx(0.30)
-    assert -0.05 < model.body("object").ipos[2] < -0.02
+    assert -0.055 < model.body("object").ipos[2] < -0.045  # water to 80 of 200 mm

@@ -1,30 +1,15 @@
-import logging
 from itertools import product
 
 import mujoco
 import numpy as np
 import pytest
+from gl_here import needs_egl
 
-from hal.errors import CameraError
-from sim_twin import render
 from sim_twin.d405 import INTRINSICS, MIN_Z_M, measure_depth
 from sim_twin.objects import OBJECT_NAMES
-from sim_twin.render import RENDER_VARIABLE, View, make_renderer
+from sim_twin.render import View, make_renderer
 from sim_twin.scene import SceneConfig
 from sim_twin.world import World
-
-
-def _has_egl() -> bool:
-    try:
-        from mujoco.egl import GLContext
-
-        GLContext(16, 16).free()
-    except (ImportError, AttributeError, RuntimeError):
-        return False
-    return True
-
-
-needs_egl = pytest.mark.skipif(not _has_egl(), reason="no OpenGL through EGL on this machine")
 
 
 def _draw(config: SceneConfig, kind: str) -> View:
@@ -88,26 +73,3 @@ def test_the_wrist_camera_does_not_see_its_own_housing() -> None:
     z_m = _draw(SceneConfig(object="cylinder"), "rays").z_m
     assert z_m[z_m > 0].min() > 0.04  # the gripper's back; the housing begins at 0 and the bracket behind it
     assert z_m[:200][z_m[:200] > 0].min() > 0.2
-
-
-def test_an_unknown_renderer_is_refused_with_the_known_ones(monkeypatch: pytest.MonkeyPatch, world: World) -> None:
-    monkeypatch.setenv(RENDER_VARIABLE, "vulkan")
-    with pytest.raises(ValueError, match="auto, egl, rays"):
-        make_renderer(world.model, INTRINSICS)
-
-
-def test_without_egl_rays_are_cast_with_one_warning(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, world: World
-) -> None:
-    def fail(*_: object) -> None:
-        raise ImportError("no libEGL")
-
-    monkeypatch.setattr(render, "EglRenderer", fail)
-    monkeypatch.setattr(render, "_warned", False)
-    monkeypatch.delenv(RENDER_VARIABLE, raising=False)
-    with caplog.at_level(logging.WARNING):
-        kinds = [type(make_renderer(world.model, INTRINSICS)).__name__ for _ in range(2)]
-    assert kinds == ["RayRenderer", "RayRenderer"]
-    assert len([record for record in caplog.records if "casts rays" in record.message]) == 1
-    with pytest.raises(CameraError, match="libegl1"):
-        make_renderer(world.model, INTRINSICS, "egl")
