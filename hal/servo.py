@@ -97,7 +97,7 @@ class Servo:
         self._motion = Motion(self.limits, state.q)
         self._overload = OverloadWatch(self.limits)
         self._state, self._q_sent = state, state.q
-        self._link_lost = self._give_way = self._ticked = False
+        self._link_lost = self._give_way = self._gave_way = self._ticked = False
         self._publish(self.clock.now_s())
 
     def _connected(self) -> Snapshot:
@@ -266,8 +266,10 @@ class Servo:
         overload = self._overload.update(state.tau)
         blocked = overload or find_blocked(self.limits, self._q_sent, state.q)
         if blocked:
-            # Holding the command would go on pushing: once at rest, the arm holds what it measures instead.
-            self._give_way = self._give_way or not self._orders.latch
+            # Holding the command would go on pushing: once at rest, the arm holds what it measures instead. Only
+            # once until it is re-armed, lest a load that does not end pull it along.
+            if not self._gave_way:
+                self._give_way = self._gave_way = True
             self._fault(blocked)
 
     def _fault(self, reason: str) -> None:
@@ -280,7 +282,7 @@ class Servo:
     def _choose(self, now_s: float) -> Wish:
         motion, orders = self._motion, self._orders
         if orders.rearmed:
-            orders.rearmed = self._link_lost = False
+            orders.rearmed = self._link_lost = self._gave_way = False
             self._give_way, motion.reason = True, ""
         if orders.done_id > motion.trajectory_id:
             motion.skip(orders.done_id, orders.cancel_reason)
@@ -329,7 +331,7 @@ class Servo:
         self._clips += allowed.clipped
         noted = np.minimum(np.maximum(q, self.limits.q_min), self.limits.q_max)
         noted[:N_ARM] = allowed.q[:N_ARM]
-        self._motion.take_note(noted, dq)
+        self._motion.take_note(noted, np.append(allowed.dq[:N_ARM], dq[N_ARM]))
         if self._link_lost:
             return
         try:

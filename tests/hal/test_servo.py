@@ -311,6 +311,23 @@ def test_braking_stays_within_speed_acceleration_and_jerk() -> None:
     assert (np.abs(jerk[3:]) <= bench.servo.limits.dddq_max[ARM] + 1e-3).all()
 
 
+def test_braking_begins_from_the_speed_the_limits_let_through() -> None:
+    bench = Bench()
+    q = np.array([START, START])
+    q[1, 0] += 0.62  # 3.1 rad/s on the whole, half as much again in the middle
+    bench.servo.stream(TrajectoryChunk(trajectory_id=1, t_s=np.array([0.0, 0.2]), q=q, dq=np.zeros((2, 7))))
+    bench.run(0.1)
+    bench.servo.stop()
+    begin = len(bench.sent)
+    bench.run_until_at_rest()
+    at_rest = len(bench.sent)
+    bench.run(0.2)
+    command = bench.commanded()[begin - 2 :, 0]
+    acceleration = np.diff(command, n=2) / CONTROL_PERIOD_S**2
+    assert np.abs(acceleration).max() <= 9.5 * DDQ_MAX[0]
+    assert bench.commanded()[at_rest:] == pytest.approx(np.tile(bench.sent[at_rest - 1], (100, 1)), abs=1e-9)
+
+
 # --- What is refused ------------------------------------------------------------------------------------------------
 
 
@@ -540,6 +557,22 @@ def test_a_blocked_joint_latches_and_the_arm_gives_way() -> None:
     assert status.mode is STOPPED
     assert "joint1 has been at its torque limit" in status.reason
     assert status.q_command[0] == pytest.approx(bench.arm.read_state().q[0], abs=1e-3)
+
+
+def test_an_arm_that_is_blocked_while_it_brakes_for_a_stop_gives_way_too_and_only_once() -> None:
+    bench = Bench()
+    bench.servo.stream(move())
+    bench.run(0.5)
+    bench.servo.stop("the button")
+    bench.arm.block(0)
+    bench.run(1.5)
+    assert (bench.mode, bench.reason) == (STOPPED, "the button")
+    blocked_at = bench.arm.read_state().q
+    assert bench.servo.status().q_command[0] == pytest.approx(blocked_at[0], abs=1e-3)
+    bench.arm.block(None)
+    bench.arm.offset[0] = -0.06  # 38 Nm: pushed away, it does not follow for ever
+    bench.run(1.0)
+    assert bench.servo.status().q_command[0] == pytest.approx(blocked_at[0], abs=1e-3)
 
 
 def test_lost_commands_are_noticed_as_a_joint_that_does_not_follow() -> None:
