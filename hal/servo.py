@@ -225,10 +225,7 @@ class Servo:
         latch = self._orders.latch
         if latch != self._latch_told:
             self._latch_told = latch
-            if latch:
-                log.warning("servo: stopped: %s. Look at the arm, then `./z1 rearm`.", latch)
-            else:
-                log.info("servo: re-armed.")
+            log.info("servo: %s", f"stopped: {latch}" if latch else "re-armed")
         clips = self._clips + self._orders.beyond
         if clips != self._clips_told and now_s - self._told_s >= _WARN_EVERY_S:
             log.warning("servo: %d setpoints were clipped to the limits.", clips - self._clips_told)

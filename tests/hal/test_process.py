@@ -5,15 +5,18 @@ from __future__ import annotations
 import socket
 import subprocess
 import sys
+from contextlib import ExitStack
 from dataclasses import replace
 from threading import Event
 
 import pytest
 
 from hal.backends.mock_arm import MockArm, make_rig
-from hal.bus.session import BusConfig
+from hal.bus import keys
+from hal.bus.service import Listener
+from hal.bus.session import BusConfig, open_session
 from hal.clock import WallClock
-from hal.errors import CameraError, NotConnectedError
+from hal.errors import CameraError, HalError, NotConnectedError
 from hal.process import serve
 
 SIGNALLED = """
@@ -66,6 +69,20 @@ def test_a_servo_that_dies_ends_the_process_with_its_error_and_the_arm_stopped()
     arm.broken = False
     with pytest.raises(NotConnectedError):
         arm.read_state()
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_a_thread_of_the_server_that_dies_ends_the_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    rig, config = make_rig(), free_config()
+    monkeypatch.setattr(rig.camera, "wait_for_frame", lambda _: 1 / 0)
+    with ExitStack() as undo:
+
+        def listen() -> None:
+            session = undo.enter_context(open_session(config, listen=False))
+            undo.callback(Listener(session, keys.FRAME, lambda _: None).close)
+
+        with pytest.raises(HalError, match="server died; its traceback is above"):
+            serve(rig, config, Event(), on_ready=listen)
 
 
 def test_a_camera_that_cannot_be_had_leaves_no_arm_connected(monkeypatch: pytest.MonkeyPatch) -> None:
