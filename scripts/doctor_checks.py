@@ -13,6 +13,10 @@ from dataclasses import dataclass
 from enum import Enum
 from importlib.util import find_spec
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from hal.bus.session import BusConfig
 
 ROOT = Path(__file__).resolve().parent.parent
 ARM_ADDRESS = "192.168.123.110"
@@ -116,7 +120,32 @@ def check_disk() -> Check:
 def check_bus_port() -> Check:
     from hal.bus.session import BusConfig
 
-    return _check_port("Zenoh port", BusConfig().port, "end the HAL process that runs, or choose another with --port")
+    config = BusConfig(connect_timeout_s=0.5)
+    check = _check_port(
+        "Zenoh port", config.port, f"end the program that holds it, or: ./z1 demo --port {config.port + 1}"
+    )
+    if check.state is State.OK or not (robot := _our_hal(config)):
+        return check
+    seen = f"{config.port} is held by our own HAL process (robot {robot!r})"
+    return Check(
+        "Zenoh port",
+        State.WARN,
+        seen,
+        f"use it with ./z1 run; for the demo end it, or: ./z1 demo --port {config.port + 1}",
+    )
+
+
+def _our_hal(config: BusConfig) -> str:
+    """Return the robot's name if a HAL process of ours answers on that port, else nothing."""
+    from hal.bus.link import Link
+    from hal.clock import WallClock
+    from hal.errors import HalError
+
+    try:
+        Link(config, WallClock(), "the doctor").close()
+    except HalError:
+        return ""
+    return config.robot
 
 
 def check_viewer_port() -> Check:
@@ -162,10 +191,8 @@ def check_locked_memory() -> Check:
     _, highest = resource.getrlimit(resource.RLIMIT_MEMLOCK)
     if highest == resource.RLIM_INFINITY or highest >= 512e6 or os.geteuid() == 0:
         return Check("locked memory", State.OK, "root" if os.geteuid() == 0 else "enough")
-    fix = (
-        f"echo '{os.environ.get('USER', '<you>')} - memlock unlimited' | sudo tee -a {_LIMITS_FILE}, then log in again"
-    )
-    return Check("locked memory", State.WARN, f"{highest / 1e6:.0f} MB: the servo loop may wait for the disk", fix)
+    seen = f"{highest / 1e6:.0f} MB: the servo loop may wait for the disk"
+    return Check("locked memory", State.WARN, seen, _limits_fix("memlock unlimited"))
 
 
 def check_camera() -> Check:

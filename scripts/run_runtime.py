@@ -10,7 +10,7 @@ import logging
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 from rich.console import Console
@@ -18,11 +18,9 @@ from rich.console import Console
 from hal.bus.client import RemoteArm, RemoteCamera
 from hal.bus.session import BusConfig
 from hal.clock import WallClock
-from z1_runtime.assembly import make_decider
-from z1_runtime.config import load_config
-from z1_runtime.frame_tap import FrameTap
-from z1_runtime.inspect import Inspector
-from z1_runtime.pipeline import PickPipeline
+
+if TYPE_CHECKING:
+    from z1_runtime.pipeline import PickPipeline
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,30 +41,42 @@ def main(config: Config) -> int:
     """Run one pick; 0 only if the jaws hold something afterwards."""
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
     console = Console(highlight=False)
-    runtime = load_config(config.config)
-    decider = make_decider(runtime)
-    decider.warm_up()
-    clock = WallClock()
     with ExitStack() as undo:
-        arm = RemoteArm(config.bus, "run", clock)
-        arm.connect()
+        arm = RemoteArm(config.bus, "run")
+        arm.connect()  # first: whoever forgot the HAL need not wait for the planner to load
         undo.callback(arm.disconnect)
-        camera = RemoteCamera(config.bus, clock)
+        camera = RemoteCamera(config.bus)
         camera.connect()
         undo.callback(camera.disconnect)
-        inspector = Inspector(config.out / "episode.rrd" if config.out else None, live=config.view)
-        undo.callback(inspector.close)
-        pipeline = PickPipeline(
-            decider=decider,
-            arm=arm,
-            camera=camera,
-            clock=clock,
-            inspector=inspector,
-            config=runtime,
-            on_phase=lambda phase: console.print(f"  {phase.name:<9} {phase.duration_s:6.2f} s"),
-        )
-        undo.enter_context(FrameTap(camera, arm, inspector))
+        with console.status("loading the planner (some seconds)"):
+            pipeline = _assemble(config, arm, camera, console, undo)
         arm.claim("run")  # given back by disconnecting, which forgives a HAL that is gone
         record = pipeline.pick()
     console.print("the jaws hold something" if record.held else "the jaws are empty")
     return 0 if record.held else 1
+
+
+def _assemble(config: Config, arm: RemoteArm, camera: RemoteCamera, console: Console, undo: ExitStack) -> PickPipeline:
+    """Return what picks; `undo` ends what it writes."""
+    from z1_runtime.assembly import make_decider
+    from z1_runtime.config import load_config
+    from z1_runtime.frame_tap import FrameTap
+    from z1_runtime.inspect import Inspector
+    from z1_runtime.pipeline import PickPipeline
+
+    runtime = load_config(config.config)
+    decider = make_decider(runtime)
+    decider.warm_up()
+    inspector = Inspector(config.out / "episode.rrd" if config.out else None, live=config.view)
+    undo.callback(inspector.close)
+    if config.out or config.view:
+        undo.enter_context(FrameTap(camera, arm, inspector))
+    return PickPipeline(
+        decider=decider,
+        arm=arm,
+        camera=camera,
+        clock=WallClock(),
+        inspector=inspector,
+        config=runtime,
+        on_phase=lambda phase: console.print(f"  {phase.name:<9} {phase.duration_s:6.2f} s"),
+    )

@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 import socket
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
+from hal.backends.mock_arm import MockArm
+from hal.backends.replay_camera import ReplayCamera
+from hal.bus.server import HalServer
+from hal.bus.session import BusConfig
+from hal.clock import WallClock
+from hal.servo import Servo
 from scripts import doctor
 from scripts import doctor_checks as checks
 from scripts.doctor_checks import Check, State
@@ -60,15 +67,34 @@ def test_every_check_answers_on_this_machine() -> None:
         assert row.fix or row.state is State.OK
 
 
-def test_taken_port_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_port_taken_by_a_stranger_keeps_the_demo_from_running(monkeypatch: pytest.MonkeyPatch) -> None:
     with socket.socket() as other:
         other.bind(("127.0.0.1", 0))
         other.listen()
         port = other.getsockname()[1]
-        monkeypatch.setattr("hal.bus.session.BusConfig", lambda: SimpleNamespace(port=port))
+        monkeypatch.setattr("hal.bus.session.BusConfig", partial(BusConfig, port=port))
         row = checks.check_bus_port()
     assert row.state is State.MISSING
-    assert str(port) in row.seen
+    assert f"{port} is taken" in row.seen
+    assert "./z1 demo --port" in row.fix
+
+
+def test_port_taken_by_our_own_hal_is_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        bus = BusConfig(port=probe.getsockname()[1])
+    monkeypatch.setattr("hal.bus.session.BusConfig", partial(BusConfig, port=bus.port))
+    clock = WallClock()
+    servo, camera = Servo(MockArm(clock), clock), ReplayCamera(clock=clock)
+    servo.connect()
+    camera.connect()
+    with HalServer(servo, camera, clock, bus):
+        row = checks.check_bus_port()
+    camera.disconnect()
+    servo.disconnect()
+    assert row.state is State.WARN
+    assert "our own HAL process" in row.seen
+    assert "./z1 run" in row.fix
 
 
 def test_missing_packages_are_named(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -128,6 +128,22 @@ def test_other_packages_on_the_path_are_kept_out(checkout: Checkout) -> None:
     assert checkout.run(PYTHONPATH="/opt/ros/lib").stdout == "path: none\n"
 
 
+def test_the_shells_choice_of_gl_is_kept_out(checkout: Checkout) -> None:
+    (checkout.tools / "fake_python").write_text('#!/bin/bash\necho "${MUJOCO_GL-none} ${PYOPENGL_PLATFORM-none}"\n')
+    assert checkout.run(MUJOCO_GL="osmesa", PYOPENGL_PLATFORM="osmesa").stdout == "none none\n"
+
+
+def test_without_flock_it_sets_up_all_the_same(checkout: Checkout) -> None:
+    tools = checkout.tools / "few"
+    tools.mkdir()
+    for name in ("bash", "readlink", "cksum", "mkdir", "mv", "rm", "cp", "dirname", "sort", "head", "df", "awk"):
+        (tools / name).symlink_to(str(shutil.which(name)))
+    (tools / "python3").symlink_to(checkout.tools / "fake_python")
+    done = checkout.run("--version", PATH=f"{checkout.tools}:{tools}")
+    assert done.returncode == 0, done.stderr
+    assert checkout.syncs() == 1
+
+
 def test_without_a_fit_python_it_says_what_to_install(checkout: Checkout) -> None:
     for name in ("python3", "python3.11", "python3.12", "python3.13", "python3.14", "python"):
         (checkout.tools / name).write_text('#!/bin/bash\n[[ $1 == --version ]] && echo "Python 3.9.2"\nexit 1\n')
