@@ -16,13 +16,13 @@ from hal.errors import InvalidMessageError
 from hal.z1 import N_JOINTS
 
 
-def frozen_array(value: Any, dtype: Any, shape: tuple[int | None, ...], name: str, *, copy: bool = True) -> np.ndarray:
-    """Return `value` as a read-only array of `dtype`, checked against `shape` (None = any length).
+def frozen_array(value: Any, dtype: Any, shape: tuple[int | None, ...], name: str) -> np.ndarray:
+    """Return a read-only copy of `value` as an array of `dtype`, checked against `shape` (None = any length).
 
     Raises:
         InvalidMessageError: wrong shape, or a float that is not finite.
     """
-    array = np.array(value, dtype=dtype, copy=True) if copy else np.asarray(value, dtype=dtype)
+    array = np.array(value, dtype=dtype)
     wrong = array.ndim != len(shape) or any(
         want is not None and want != have for want, have in zip(shape, array.shape, strict=True)
     )

@@ -21,7 +21,7 @@ class Rig:
     clock: Clock
     call_every_tick: Callable[[Callable[[], None]], None] | None = None
     """In lock-step: registers what the clock calls every control period while somebody sleeps on it. None when the
-    clock is the wall's, where `hal.servo.ServoThread` does the calling."""
+    clock is the wall's, where `hal.servo_thread.ServoThread` does the calling."""
     world: Any = None
     """The simulated world behind the devices, for evaluation only; None on a real robot."""
 

@@ -19,7 +19,6 @@ from hal.motion import Motion, Wish
 from hal.orders import Orders, Snapshot
 from hal.periods import PeriodStatistics
 from hal.playback import Playback
-from hal.servo_thread import ServoThread  # noqa: F401  (the servo and its driver are imported from one place)
 from hal.z1 import N_ARM
 
 log = logging.getLogger(__name__)

@@ -26,7 +26,8 @@ import tyro
 from hal.backends.mock_arm import MockArm
 from hal.clock import Stopwatch, WallClock
 from hal.messages import TrajectoryChunk
-from hal.servo import Servo, ServoThread
+from hal.servo import Servo
+from hal.servo_thread import ServoThread
 from hal.z1 import CONTROL_PERIOD_S, N_JOINTS, Q_MAX, Q_MIN
 
 _BARE_C = r"""

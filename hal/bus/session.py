@@ -48,8 +48,8 @@ class BusConfig:
         if not 1 <= self.port <= 65535:
             raise ValueError(f"port is {self.port}; allowed is 1 to 65535.")
         for name in ("connect_timeout_s", "request_timeout_s", "state_max_age_s", "state_rate_hz", "heartbeat_rate_hz"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} is {getattr(self, name)}; it must be above 0.")
+            if not 0 < getattr(self, name) < float("inf"):
+                raise ValueError(f"{name} is {getattr(self, name)}; it must be above 0 and finite.")
 
     @property
     def endpoint(self) -> str:

@@ -23,7 +23,8 @@ from hal.camera import Camera
 from hal.clock import Clock, ManualClock, WallClock
 from hal.registry import ARMS, CAMERAS
 from hal.rig import RIGS
-from hal.servo import Servo, ServoThread
+from hal.servo import Servo
+from hal.servo_thread import ServoThread
 
 
 @dataclass(frozen=True)

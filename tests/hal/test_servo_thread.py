@@ -11,7 +11,8 @@ from servo_bench import START, STEP, move
 from hal.backends.mock_arm import MockArm
 from hal.clock import ManualClock, WallClock
 from hal.messages import ServoMode
-from hal.servo import Servo, ServoThread
+from hal.servo import Servo
+from hal.servo_thread import ServoThread
 from hal.z1 import CONTROL_PERIOD_S, N_ARM
 
 

@@ -22,6 +22,7 @@ from hal.errors import HalError, HalTimeoutError
         {"port": 0},
         {"port": 70000},
         {"request_timeout_s": 0.0},
+        {"state_rate_hz": float("inf")},
         {"connect_timeout_s": float("nan")},
     ],
 )
