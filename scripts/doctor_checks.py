@@ -22,6 +22,7 @@ ROOT = Path(__file__).resolve().parent.parent
 ARM_ADDRESS = "192.168.123.110"
 """The vendor's address of a Z1's board."""
 
+# Without ultralytics, which those who ship this may leave out (see NOTICE).
 _MODULES = [
     "numpy",
     "scipy",
@@ -33,7 +34,6 @@ _MODULES = [
     "ruckig",
     "mujoco",
     "cv2",
-    "ultralytics",
     "torch",
     "zenoh",
     "msgpack",

@@ -43,6 +43,13 @@ def test_depth_comes_in_tenths_of_a_millimetre() -> None:
         assert units.max() > 0
 
 
+def test_depth_steps_are_those_of_a_disparity_in_32nds_of_a_pixel() -> None:
+    depth = measure_depth(_wall(0.5), seed=0, sequence=1).astype(np.float64)
+    steps = 32.0 * INTRINSICS.fx * BASELINE_M / depth[depth > 0]
+    # At 0.5 m one step is 1.1 mm: rounding to 0.1 mm moves a depth by at most 1/22 of it.
+    assert np.abs(steps - np.round(steps)).max() < 0.06
+
+
 def test_nothing_nearer_than_min_z_is_measured() -> None:
     assert not measure_depth(_wall(MIN_Z_M - 0.005), seed=0, sequence=1).any()
     assert not round_depth(_wall(MIN_Z_M - 0.005)).any()
