@@ -89,11 +89,12 @@ class Decider:
         config = self.config
         times = StageTimes()
         with times.stage("total"):
+            jaw = float(q[-1])
             T_base_camera = self.kinematics.flange(q[: z1.N_ARM]) @ self.T_flange_camera
             with times.stage("detect"):
-                detection = self.perception.detect(frame, T_base_camera)
+                detection = self.perception.detect(frame, T_base_camera, jaw)
             with times.stage("cloud"):
-                observation = self.perception.segment(frame, T_base_camera, detection)
+                observation = self.perception.segment(frame, T_base_camera, jaw, detection)
             with times.stage("generate"):
                 candidates = self.generator.sample(observation.object_points, config.n_candidates, config.seed)
             with times.stage("mvbb"):

@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 
 from hal.messages import RgbdFrame
-from hal.z1 import T_FLANGE_CAMERA
 from models.types import Detection
 from z1_runtime.cloud import (
     PerceptionError,
@@ -34,7 +33,7 @@ class Detector(Protocol):
         """Return what was found, most confident first; empty when there is nothing.
 
         Args:
-            frame: the image.
+            frame: the image; where it showed the robot's own gripper its depth is 0.
             T_base_camera: (4, 4) camera pose when it was taken.
 
         Raises:
@@ -65,30 +64,6 @@ class TruthDetector:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class OwnGripper:
-    """The part of the image's space that the robot's own jaws may fill, fixed to the camera.
-
-    The camera's place is the nominal one; the margin covers its calibration.
-    """
-
-    lower_m: tuple[float, float, float] = (-0.10, -0.055, -0.050)
-    """Lower corner in the flange frame [m]."""
-    upper_m: tuple[float, float, float] = (0.212, 0.055, 0.112)
-    """Upper corner in the flange frame [m]: what the meshes sweep over the whole jaw range, and 12 mm."""
-
-    def contains(self, points: np.ndarray) -> np.ndarray:
-        """Return the (N,) bool points (camera frame) that may be the robot itself."""
-        # The jaws end 0.23 m from the camera, so most of a scene need not be transformed to be cleared.
-        inside = np.zeros(len(points), bool)
-        corner = np.abs(np.array([self.lower_m, self.upper_m]) - T_FLANGE_CAMERA[:3, 3]).max(axis=0)
-        near = np.flatnonzero(points[:, 2] < np.linalg.norm(corner))
-        inside[near] = inside_box(
-            transform(T_FLANGE_CAMERA, points[near]), np.array(self.lower_m), np.array(self.upper_m)
-        )
-        return inside
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class TabletopConfig:
     """What counts as an object on the table."""
 
@@ -113,7 +88,6 @@ class TabletopConfig:
     border_confidence: float = 0.3
     """Factor on the confidence of what the border of the depth image cuts: clutter, or too little is seen of it."""
     table: TableConfig = field(default_factory=TableConfig)
-    own: OwnGripper = field(default_factory=OwnGripper)
 
 
 class TabletopDetector:
@@ -141,7 +115,7 @@ class TabletopDetector:
         p_base = transform(T_base_camera, points)
         p_base[:, 2] = table.plane.height_m(points)  # a table off z = 0, or a hand-eye error, shall not matter
         standing = inside_box(p_base, np.array(config.workspace_lower_m), np.array(config.workspace_upper_m))
-        standing &= table.above(points, config.min_height_m) & ~config.own.contains(points)
+        standing &= table.above(points, config.min_height_m)
         index = np.flatnonzero(standing)
         labels = self._footprint_labels(p_base[index])
         pixels = np.flatnonzero(seen)[index]

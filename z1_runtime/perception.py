@@ -21,7 +21,8 @@ from z1_runtime.cloud import (
     valid_pixels,
     voxel_downsample,
 )
-from z1_runtime.detectors import Detector, OwnGripper
+from z1_runtime.detectors import Detector
+from z1_runtime.own_gripper import OwnGripper
 from z1_runtime.table import TableConfig, expected_table, fit_table
 from z1_runtime.types import Observation
 
@@ -69,6 +70,22 @@ class PerceptionConfig:
     table: TableConfig = field(default_factory=TableConfig)
     own: OwnGripper = field(default_factory=OwnGripper)
 
+    def __post_init__(self) -> None:
+        low, high = self.clip_percent
+        if not 0.0 <= low < high <= 100.0:
+            raise ValueError(
+                f"clip_percent is {self.clip_percent}; it must be (low, high) with 0 <= low < high <= 100."
+            )
+        for name in ("d_max_m", "statistical_n_sigma", "radius_m"):
+            if not 0.0 < getattr(self, name) < np.inf:
+                raise ValueError(f"{name} is {getattr(self, name)}; it must be positive and finite.")
+        for name in ("statistical_k", "radius_min_neighbours", "filter_points", "max_points", "min_points"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} is {getattr(self, name)}; it must be 1 or more.")
+        for name in ("min_height_m", "voxel_m", "rim_px"):
+            if not 0.0 <= getattr(self, name) < np.inf:
+                raise ValueError(f"{name} is {getattr(self, name)}; it must be finite and not negative.")
+
 
 class Perception:
     """Detects one object and cuts the clouds; `observe` is `detect` and then `segment`."""
@@ -77,16 +94,17 @@ class Perception:
         self._config = config
         self._detector = detector
 
-    def observe(self, frame: RgbdFrame, T_base_camera: np.ndarray, label: str | None = None) -> Observation:
+    def observe(self, frame: RgbdFrame, T_base_camera: np.ndarray, jaw: float, label: str | None = None) -> Observation:
         """Return what is seen; arguments and errors as in `detect` and `segment`."""
-        return self.segment(frame, T_base_camera, self.detect(frame, T_base_camera, label))
+        return self.segment(frame, T_base_camera, jaw, self.detect(frame, T_base_camera, jaw, label))
 
-    def detect(self, frame: RgbdFrame, T_base_camera: np.ndarray, label: str | None = None) -> Detection:
+    def detect(self, frame: RgbdFrame, T_base_camera: np.ndarray, jaw: float, label: str | None = None) -> Detection:
         """Return the most confident detection.
 
         Args:
             frame: the image.
             T_base_camera: (4, 4) camera pose when it was taken.
+            jaw: mover angle when it was taken; the robot's own gripper is left out [rad].
             label: the wanted class; ignored by a detector that knows no classes.
 
         Raises:
@@ -94,7 +112,7 @@ class Perception:
             NoDetectionError: nothing (of that class) was found.
         """
         _require_depth(frame)
-        found = self._detector.detect(frame, T_base_camera)
+        found = self._detector.detect(self._config.own.blanked(frame, jaw), T_base_camera)
         wanted = [d for d in found if label is None or not self._detector.classes or d.label == label]
         if not wanted:
             others = f"; it saw {', '.join(sorted({d.label for d in found}))}" if found else ""
@@ -104,7 +122,7 @@ class Perception:
             )
         return wanted[0]
 
-    def segment(self, frame: RgbdFrame, T_base_camera: np.ndarray, detection: Detection) -> Observation:
+    def segment(self, frame: RgbdFrame, T_base_camera: np.ndarray, jaw: float, detection: Detection) -> Observation:
         """Return the clouds and the table for one detection.
 
         The object: crop by mask (or box) → 0 < d ≤ d_max → depth percentiles → table taken off → flying pixels, then
@@ -118,7 +136,7 @@ class Perception:
             SmallCloudError: too little is left of the object; the message counts each stage.
         """
         _require_depth(frame)
-        config, depth = self._config, frame.depth_m
+        config, depth = self._config, self._config.own.blanked(frame, jaw).depth_m
         crop = detection.mask if detection.mask is not None else box_pixels(depth.shape, detection.box_px)
         rim = cv2.dilate(crop.astype(np.uint8), np.ones((2 * config.rim_px + 1,) * 2, np.uint8)).astype(bool)
         continuous = continuous_pixels(depth)
@@ -126,9 +144,8 @@ class Perception:
         points = back_project(depth, frame.intrinsics, seen)
         table = fit_table(points, expected_table(T_base_camera), config.table)
         above = table.above(points, config.min_height_m)
-        foreign = ~config.own.contains(points)
 
-        candidate = crop[seen] & foreign
+        candidate = crop[seen]
         object_points = self._clean(points[candidate], above[candidate], continuous[seen][candidate])
         return Observation(
             frame=frame,
@@ -136,7 +153,7 @@ class Perception:
             detection=detection,
             object_points=object_points,
             # The table under a box-shaped crop is scene; what stands inside the crop is not.
-            scene_points=points[continuous[seen] & foreign & ~(rim[seen] & above)],
+            scene_points=points[continuous[seen] & ~(rim[seen] & above)],
             table=table.plane,
         )
 

@@ -11,7 +11,7 @@ import numpy as np
 import pinocchio as pin  # pyright: ignore[reportMissingImports] - a .pth file leads to it
 
 from hal.messages import Intrinsics, RgbdFrame
-from hal.z1 import Q_HOME, T_FLANGE_CAMERA, urdf_path
+from hal.z1 import Q_HOME, T_FLANGE_CAMERA, T_FLANGE_PIVOT, mesh_dir, urdf_path
 
 INTRINSICS = Intrinsics(width=640, height=480, fx=382.26, fy=382.26, cx=319.5, cy=239.5)
 BASELINE_M = 0.018
@@ -89,6 +89,32 @@ def cast(
     which = depths.argmin(axis=0) - 1
     depth = depths.min(axis=0)
     return np.where(depth < 6.5, depth, 0.0), which
+
+
+@cache
+def gripper_depth(jaw: float) -> np.ndarray:
+    """Return depth (480, 640) [m] of the gripper alone, its meshes with the mover at `jaw` [rad]; inf beside it."""
+    import trimesh
+
+    T_camera_pivot = np.linalg.inv(T_FLANGE_CAMERA) @ T_FLANGE_PIVOT
+    T_pivot_stator, T_pivot_mover = np.eye(4), np.eye(4)
+    T_pivot_stator[0, 3] = -0.049
+    T_pivot_mover[:3, :3] = cv2.Rodrigues(np.array([0.0, jaw, 0.0]))[0]
+    depth = np.full((INTRINSICS.height, INTRINSICS.width), np.inf)
+    for name, T in (("z1_GripperStator", T_pivot_stator), ("z1_GripperMover", T_pivot_mover)):
+        mesh = trimesh.load_mesh(mesh_dir() / "collision" / f"{name}.STL")
+        points = trimesh.sample.sample_surface(mesh, 400_000, seed=0)[0]
+        x, y, z = (T_camera_pivot @ T @ np.column_stack([points, np.ones(len(points))]).T)[:3]
+        u = np.rint(INTRINSICS.fx * x / z + INTRINSICS.cx).astype(int)
+        v = np.rint(INTRINSICS.fy * y / z + INTRINSICS.cy).astype(int)
+        seen = (z > 0.05) & (u >= 0) & (u < INTRINSICS.width) & (v >= 0) & (v < INTRINSICS.height)
+        np.minimum.at(depth, (v[seen], u[seen]), z[seen])
+    return depth
+
+
+def before(near: np.ndarray, far: np.ndarray) -> np.ndarray:
+    """Return the depth of what is nearer of two images; 0 in `far` and inf in `near` are nothing."""
+    return np.where(np.isfinite(near) & ((far == 0) | (near < far)), near, far)
 
 
 def d405(depth: np.ndarray, seed: int, noise_px: float = 0.08) -> np.ndarray:

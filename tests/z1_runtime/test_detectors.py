@@ -4,14 +4,11 @@ import numpy as np
 import pytest
 from tabletop_scene import INTRINSICS, Box, Cylinder, T_base_camera, cast, d405, frame_of, noisy_frame, truth
 
-from hal.z1 import T_FLANGE_CAMERA
 from z1_runtime.cloud import PerceptionError
-from z1_runtime.detectors import OwnGripper, TabletopDetector, TruthDetector, make_detector, mask_box
+from z1_runtime.detectors import TabletopDetector, TruthDetector, make_detector, mask_box
 from z1_runtime.table import NoTableError
 
 BOTTLE = Cylinder(0.5, 0.0, 0.0325, 0.2)
-JAWS = Box(0.25, 0.0, (0.15, 0.08, 0.08), bottom_m=0.16)
-"""Inside what the gripper fills at home."""
 
 
 def iou(a, b):
@@ -47,23 +44,6 @@ def test_a_table_that_is_not_quite_where_it_should_be_changes_nothing(tilt_rad, 
     found = TabletopDetector().detect(frame, T_base_camera())
     assert len(found) == 1
     assert iou(found[0].mask, truth(frame)) >= 0.9
-
-
-def test_the_robots_own_jaws_are_not_an_object():
-    seen = TabletopDetector().detect(noisy_frame([JAWS]), T_base_camera())
-    assert seen == []
-    frame = noisy_frame([BOTTLE, JAWS])
-    found = TabletopDetector().detect(frame, T_base_camera())
-    assert len(found) == 1
-    assert iou(found[0].mask, truth(frame)) >= 0.9
-
-
-def test_the_own_gripper_region_ends_past_the_fingertips_and_holds_no_object():
-    own = OwnGripper()
-    T_camera_flange = np.linalg.inv(T_FLANGE_CAMERA)
-    flange = np.array([[0.2, 0.0, 0.0], [0.12, 0.0, 0.1], [0.23, 0.0, 0.0], [0.15, 0.1, 0.0]])
-    points = flange @ T_camera_flange[:3, :3].T + T_camera_flange[:3, 3]
-    assert own.contains(points).tolist() == [True, True, False, False]
 
 
 def test_a_horizontal_gap_in_the_depth_does_not_cut_an_object_in_two():

@@ -52,13 +52,11 @@ def test_frames_are_shown_with_the_camera_s_pose_and_the_thread_ends_with_the_bl
     camera.connect()
     with FrameTap(camera, arm, album, rate_hz=200.0):
         assert album.full.wait(PATIENCE_S)
-    n = len(album.seen)
     assert "frame tap" not in threads()
     sequences = [frame.sequence for frame, _ in album.seen]
     assert sequences == sorted(set(sequences))
     for _, T_base_camera in album.seen:
         np.testing.assert_allclose(T_base_camera, Kinematics().flange(Q[:6]) @ z1.T_FLANGE_CAMERA, atol=1e-6)
-    assert len(album.seen) == n
 
 
 def test_a_camera_that_fails_ends_the_showing_with_a_warning_and_nothing_else(arm, caplog):

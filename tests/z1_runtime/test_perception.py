@@ -5,7 +5,6 @@ import pytest
 from scipy.spatial import KDTree
 from tabletop_scene import INTRINSICS, Box, Cylinder, T_base_camera, cast, frame_of, noisy_frame, truth
 
-from hal.z1 import T_FLANGE_CAMERA
 from models.types import Detection
 from z1_runtime.cloud import back_project, transform
 from z1_runtime.detectors import TabletopDetector, TruthDetector, mask_box
@@ -20,7 +19,7 @@ from z1_runtime.perception import (
 
 BOTTLE = Cylinder(0.5, 0.05, 0.0325, 0.2)
 BOX = Box(0.45, -0.05, (0.06, 0.1, 0.18), 0.4)
-JAWS = Box(0.25, 0.0, (0.15, 0.08, 0.08), bottom_m=0.16)
+JAW = -1.0
 
 
 def make(detector=None, **config):
@@ -48,7 +47,7 @@ class Fixed:
 @pytest.mark.parametrize("detector", [TabletopDetector(), TruthDetector()])
 @pytest.mark.parametrize("target", [BOTTLE, BOX, Cylinder(0.56, 0.15, 0.0325, 0.2)])
 def test_the_objects_cloud_covers_the_object_and_nothing_else(target, detector):
-    seen = make(detector).observe(noisy_frame([target]), T_base_camera())
+    seen = make(detector).observe(noisy_frame([target]), T_base_camera(), JAW)
     exact = surface([target])
     assert 1000 < len(seen.object_points) <= 5000
     # 3σ of the depth noise at 0.5 m is 9 mm; nothing of the table, no flying pixel hangs behind.
@@ -57,7 +56,7 @@ def test_the_objects_cloud_covers_the_object_and_nothing_else(target, detector):
 
 
 def test_the_objects_cloud_holds_no_table():
-    seen = make().observe(noisy_frame([BOX]), T_base_camera())
+    seen = make().observe(noisy_frame([BOX]), T_base_camera(), JAW)
     heights = transform(T_base_camera(), seen.object_points)[:, 2]
     assert heights.min() > 0.004
     assert heights.min() < 0.010  # nor is more cut off than the noise asks for
@@ -66,9 +65,9 @@ def test_the_objects_cloud_holds_no_table():
 
 def test_a_box_without_a_mask_gives_the_object_too_and_leaves_its_table_in_the_scene():
     frame = noisy_frame([BOX])
-    by_mask = make(TruthDetector()).observe(frame, T_base_camera())
+    by_mask = make(TruthDetector()).observe(frame, T_base_camera(), JAW)
     detection = Detection(label="box", confidence=0.8, box_px=mask_box(truth(frame)))
-    by_box = make().segment(frame, T_base_camera(), detection)
+    by_box = make().segment(frame, T_base_camera(), JAW, detection)
     exact = surface([BOX])
     assert KDTree(exact).query(by_box.object_points)[0].max() < 0.01
     assert (KDTree(by_box.object_points).query(exact)[0] < 0.006).mean() >= 0.9
@@ -78,7 +77,7 @@ def test_a_box_without_a_mask_gives_the_object_too_and_leaves_its_table_in_the_s
 def test_the_scene_is_the_rest_at_full_resolution():
     scene = [BOTTLE, Box(0.56, -0.12, (0.05, 0.05, 0.1))]
     frame = noisy_frame(scene)
-    seen = make().observe(frame, T_base_camera())
+    seen = make().observe(frame, T_base_camera(), JAW)
     neighbour = surface(scene, 1)
     assert (KDTree(seen.scene_points).query(neighbour)[0] < 0.005).mean() > 0.9
     measured = ((frame.depth_m > 0) & (frame.depth_m <= 1.0)).sum()
@@ -86,22 +85,14 @@ def test_the_scene_is_the_rest_at_full_resolution():
 
 
 def test_no_scene_point_hangs_around_the_object():
-    seen = make().observe(noisy_frame([BOTTLE]), T_base_camera())
+    seen = make().observe(noisy_frame([BOTTLE]), T_base_camera(), JAW)
     p_base = transform(T_base_camera(), seen.scene_points)
     around = np.hypot(p_base[:, 0] - BOTTLE.x, p_base[:, 1] - BOTTLE.y) < 0.08
     assert (p_base[around, 2] > 0.015).sum() <= 5
 
 
-def test_the_robots_own_jaws_are_neither_object_nor_scene():
-    seen = make().observe(noisy_frame([BOTTLE, JAWS]), T_base_camera())
-    for points in (seen.object_points, seen.scene_points):
-        flange = transform(T_FLANGE_CAMERA, points)
-        own = (np.abs(flange[:, 1]) < 0.04) & (flange[:, 0] > 0.0) & (flange[:, 0] < 0.2) & (flange[:, 2] < 0.1)
-        assert not (own & (flange[:, 2] > -0.035)).any()
-
-
 def test_the_table_comes_in_the_camera_frame():
-    seen = make().observe(noisy_frame([BOTTLE]), T_base_camera())
+    seen = make().observe(noisy_frame([BOTTLE]), T_base_camera(), JAW)
     T = T_base_camera()
     np.testing.assert_allclose(T[:3, :3] @ seen.table.normal, [0, 0, 1], atol=np.deg2rad(0.3))
     assert seen.table.height_m(np.zeros((1, 3)))[0] == pytest.approx(T[2, 3], abs=0.001)
@@ -109,8 +100,8 @@ def test_the_table_comes_in_the_camera_frame():
 
 def test_observe_is_detect_and_then_segment_bit_by_bit():
     frame, perception = noisy_frame([BOTTLE]), make()
-    whole = perception.observe(frame, T_base_camera())
-    parts = perception.segment(frame, T_base_camera(), perception.detect(frame, T_base_camera()))
+    whole = perception.observe(frame, T_base_camera(), JAW)
+    parts = perception.segment(frame, T_base_camera(), JAW, perception.detect(frame, T_base_camera(), JAW))
     assert whole.object_points.tobytes() == parts.object_points.tobytes()
     assert whole.scene_points.tobytes() == parts.scene_points.tobytes()
     assert whole.table.normal.tobytes() == parts.table.normal.tobytes()
@@ -121,32 +112,32 @@ def test_the_wanted_class_is_taken_even_when_another_is_surer():
     cup = Detection(label="cup", confidence=0.9, box_px=(0, 0, 10, 10))
     bottle = Detection(label="bottle", confidence=0.6, box_px=mask_box(truth(frame)))
     perception = make(Fixed(cup, bottle))
-    assert perception.detect(frame, T_base_camera()) is cup
-    assert perception.detect(frame, T_base_camera(), "bottle") is bottle
+    assert perception.detect(frame, T_base_camera(), JAW) is cup
+    assert perception.detect(frame, T_base_camera(), JAW, "bottle") is bottle
 
 
 def test_a_detector_without_classes_takes_any_label():
-    assert make().detect(noisy_frame([BOTTLE]), T_base_camera(), "bottle").confidence > 0.5
+    assert make().detect(noisy_frame([BOTTLE]), T_base_camera(), JAW, "bottle").confidence > 0.5
 
 
 def test_nothing_on_the_table_is_an_error_that_says_what_to_do():
     with pytest.raises(NoDetectionError, match=r"TabletopDetector found no object\. Put the object"):
-        make().observe(noisy_frame([]), T_base_camera())
+        make().observe(noisy_frame([]), T_base_camera(), JAW)
 
 
 def test_only_other_classes_is_an_error_that_names_them():
     cup = Detection(label="cup", confidence=0.9, box_px=(0, 0, 10, 10))
     with pytest.raises(NoDetectionError, match="found no bottle; it saw cup"):
-        make(Fixed(cup)).detect(noisy_frame([BOTTLE]), T_base_camera(), "bottle")
+        make(Fixed(cup)).detect(noisy_frame([BOTTLE]), T_base_camera(), JAW, "bottle")
 
 
 def test_an_empty_depth_image_is_an_error_in_both_steps():
     frame = frame_of(np.zeros((480, 640), np.float32))
     detection = Detection(label="object", confidence=1.0, box_px=(100, 100, 200, 200))
     with pytest.raises(NoDepthError, match="the depth image holds no measurement"):
-        make().detect(frame, T_base_camera())
+        make().detect(frame, T_base_camera(), JAW)
     with pytest.raises(NoDepthError, match="the depth image holds no measurement"):
-        make().segment(frame, T_base_camera(), detection)
+        make().segment(frame, T_base_camera(), JAW, detection)
 
 
 def test_too_few_points_are_an_error_that_counts_each_stage():
@@ -155,10 +146,10 @@ def test_too_few_points_are_an_error_that_counts_each_stage():
     with pytest.raises(
         SmallCloudError, match=r"only \d+ points .* 100 are needed .*crop \d+, depth clip \d+, table off"
     ):
-        make().segment(frame, T_base_camera(), on_the_table)
+        make().segment(frame, T_base_camera(), JAW, on_the_table)
     outside = Detection(label="object", confidence=1.0, box_px=(700, 500, 720, 520))
     with pytest.raises(SmallCloudError, match="crop 0"):
-        make().segment(frame, T_base_camera(), outside)
+        make().segment(frame, T_base_camera(), JAW, outside)
 
 
 def test_every_error_is_a_perception_error():
@@ -169,6 +160,20 @@ def test_every_error_is_a_perception_error():
 
 def test_without_voxels_the_cloud_holds_measured_points_only():
     frame = noisy_frame([BOTTLE])
-    seen = make(voxel_m=0.0).observe(frame, T_base_camera())
+    seen = make(voxel_m=0.0).observe(frame, T_base_camera(), JAW)
     measured = back_project(frame.depth_m, INTRINSICS, frame.depth_m > 0)
     assert KDTree(measured).query(seen.object_points)[0].max() == 0.0
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"clip_percent": (99.0, 1.0)}, "clip_percent"),
+        ({"d_max_m": float("nan")}, "d_max_m is nan"),
+        ({"voxel_m": -0.001}, "voxel_m is -0.001"),
+        ({"min_points": 0}, "min_points is 0"),
+    ],
+)
+def test_a_configuration_that_makes_no_sense_is_refused(wrong, said):
+    with pytest.raises(ValueError, match=said):
+        PerceptionConfig(**wrong)
