@@ -71,6 +71,10 @@ class RuntimeConfig:
         _require(0.0 <= self.alpha <= 1.0, "alpha", self.alpha, "0 to 1")
         _require(0.0 < self.speed <= 1.0, "speed", self.speed, "above 0, up to 1")
         _require(-1.5707 <= self.jaw_home <= 0.0, "jaw_home", self.jaw_home, "-1.5707 (open) to 0 (closed) rad")
+        _require(-1.5707 <= self.jaw_empty <= 0.0, "jaw_empty", self.jaw_empty, "-1.5707 to 0 rad")
+        _require(0.0 <= self.held_torque_nm < 30.0, "held_torque_nm", self.held_torque_nm, "0 to 30 Nm")
+        _require(0.0 <= self.hold_s <= 60.0, "hold_s", self.hold_s, "0 to 60 s")
+        _require(0.0 < self.frame_timeout_s <= 60.0, "frame_timeout_s", self.frame_timeout_s, "above 0, up to 60 s")
 
 
 def load_config(path: Path | None = None) -> RuntimeConfig:
