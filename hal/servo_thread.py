@@ -83,9 +83,9 @@ class ServoThread:
         self.stop()
 
     def _run(self) -> None:
-        _prepare(self._cpu)
-        self._servo.periods.measure(True)
         try:
+            _prepare(self._cpu)
+            self._servo.periods.measure(True)
             self._tick_for_ever()
         except Exception as error:  # every kind: a servo that dies must say so and leave the arm stopped
             self._error = error
