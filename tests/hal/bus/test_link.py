@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import logging
 from threading import Event, Thread
 
@@ -452,3 +453,9 @@ def _hello(config: BusConfig):
     from hal.bus.codec import Hello
 
     return Hello(robot=config.robot, versions=(), now_s=WallClock().now_s())
+
+
+def test_a_call_that_kept_the_interpreter_to_itself_does_not_make_the_arm_look_silent(hal, remote_arm):
+    sleep_holding_the_gil = ctypes.PyDLL(None).usleep
+    sleep_holding_the_gil(int(1e6 * (0.2 + hal.config.state_max_age_s)))
+    assert remote_arm.read_state().q.shape == (7,)
