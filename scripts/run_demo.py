@@ -80,7 +80,9 @@ def main(config: Config) -> int:
     try:
         with ExitStack() as undo:
             start = Stopwatch()
-            with console.status("starting the twin, loading the planner (some seconds)"):
+            with console.status(
+                "starting the twin, loading the planner (some seconds; half a minute the first time, to compile)"
+            ):
                 process = None if config.lockstep else _start_hal(config, scene, undo)
                 robot, pipeline = _assemble(config, scene, process, console, undo)
             console.print(f"  {'start':<9} {1e-3 * start.lap_ms():6.2f} s")

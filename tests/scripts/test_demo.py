@@ -140,9 +140,9 @@ def demo_in_motion(out: Path) -> tuple[subprocess.Popen[str], int]:
 def test_ctrl_c_in_mid_motion_ends_both_processes_in_order(tmp_path: Path) -> None:
     demo, hal = demo_in_motion(tmp_path)
     demo.send_signal(signal.SIGINT)
-    _, err = demo.communicate(timeout=60)
+    _, err = demo.communicate(timeout=120)
     assert demo.returncode == 130
-    assert err == "interrupted\n"
+    assert err.endswith("interrupted\n") and "Traceback" not in err
     assert not Path(f"/proc/{hal}").exists()
     assert "Traceback" not in (tmp_path / "hal.log").read_text()
     assert not read_summary(tmp_path)["success"]
@@ -151,7 +151,7 @@ def test_ctrl_c_in_mid_motion_ends_both_processes_in_order(tmp_path: Path) -> No
 def test_a_hal_that_dies_in_mid_motion_is_one_clear_error(tmp_path: Path) -> None:
     demo, hal = demo_in_motion(tmp_path)
     subprocess.run(["kill", "-KILL", str(hal)], check=True)
-    _, err = demo.communicate(timeout=60)
+    _, err = demo.communicate(timeout=120)
     assert demo.returncode == 1
     errors = [line for line in err.splitlines() if line.startswith("error: ")]
     assert len(errors) == 1 and "Traceback" not in err, err
@@ -240,7 +240,7 @@ def test_stop_in_mid_motion_latches_until_rearmed(
     wait_for_motion(witness, runtime)
     assert cli.main(["stop", f"--port={bus.port}"]) == 0
     assert wait_for_rest(witness).mode is ServoMode.STOPPED
-    _, said = runtime.communicate(timeout=60)
+    _, said = runtime.communicate(timeout=120)
     assert runtime.returncode == 1 and said.startswith("error: ")
     assert_still(witness)
     capfd.readouterr()
