@@ -132,13 +132,14 @@ class Kinematics:
         inside = [q for q in solutions if (q >= _ARM_MIN - _LIMIT_ATOL).all() and (q <= _ARM_MAX + _LIMIT_ATOL).all()]
         return [np.clip(q, _ARM_MIN, _ARM_MAX) for q in inside]
 
-    def best(self, T_base_pivot: np.ndarray, q_near: np.ndarray = z1.Q_HOME, *, least_squares: bool = True) -> IkResult:
+    def best(self, T_base_pivot: np.ndarray, q_near: np.ndarray = z1.Q_HOME) -> IkResult:
         """Return the solution that minimises ‖q − q_near‖² inside the limits (the paper's choice among branches).
+
+        Where there is no branch, the nearest pose is searched by the paper's regularised least squares, in 1 to 3 ms.
 
         Args:
             T_base_pivot: (4, 4) pose to reach.
             q_near: (6,) posture to stay close to, the paper's q_home [rad].
-            least_squares: where there is no branch, search the nearest pose by regularised least squares (some ms).
 
         Raises:
             IkFailure: nothing within 2 mm and 1°.
@@ -155,8 +156,6 @@ class Kinematics:
                 position_error_m=position_error_m,
                 rotation_error_rad=rotation_error_rad,
             )
-        if not least_squares:
-            raise IkFailure(f"no joints inside the limits reach {_describe(T_base_pivot)} exactly.")
         return self._best_least_squares(np.asarray(T_base_pivot, dtype=np.float64), np.asarray(q_near))
 
     def follow(
