@@ -72,8 +72,8 @@ def test_the_demo_lifts_the_bottle_with_two_processes_over_zenoh(tmp_path: Path)
 def test_in_lockstep_the_same_seed_gives_the_same_figures_in_any_process(tmp_path: Path) -> None:
     here, there = tmp_path / "here", tmp_path / "there"
     options = ("demo", "--lockstep", "--object=box", "--seed=3")
-    assert cli.main([*options, f"--out={here}"]) == 0
     other = z1(*options, f"--out={there}")
+    assert cli.main([*options, f"--out={here}"]) == 0
     _, err = other.communicate(timeout=240)
     assert other.returncode == 0, err
     first, second = ({k: v for k, v in read_summary(folder).items() if k not in TIMES} for folder in (here, there))
