@@ -1,6 +1,4 @@
-"""A configuration becomes a decider made of the parts it names."""
-
-from __future__ import annotations
+"""A configuration becomes a decider made of the parts it names; generators are chosen by name."""
 
 from dataclasses import replace
 
@@ -9,10 +7,32 @@ import pytest
 
 from hal import z1
 from models.antipodal import AntipodalSampler
-from z1_runtime.assembly import make_decider
-from z1_runtime.config import RuntimeConfig
+from models.graspgen.sampler import DiffusionSampler
+from z1_runtime.assembly import make_decider, make_generator
+from z1_runtime.config import ConfigError, RuntimeConfig, load_config
 from z1_runtime.motion_limits import MotionLimits
 from z1_runtime.planner import PlannerConfig
+
+
+def test_each_name_makes_its_generator():
+    assert isinstance(make_generator("antipodal"), AntipodalSampler)
+    assert isinstance(make_generator("diffusion"), DiffusionSampler)
+
+
+def test_an_unknown_generator_is_refused_with_the_known_ones(tmp_path):
+    with pytest.raises(ValueError, match="antipodal, diffusion"):
+        make_generator("oracle")
+    path = tmp_path / "config.yaml"
+    path.write_text("generator: oracle\n")
+    with pytest.raises(ConfigError, match="antipodal or diffusion"):
+        load_config(path)
+
+
+def test_a_file_may_choose_the_learned_generator(tmp_path):
+    path = tmp_path / "config.yaml"
+    path.write_text("generator: diffusion\n")
+    assert load_config(path).generator == "diffusion"
+    assert RuntimeConfig().generator == "antipodal"
 
 
 def test_the_parts_get_the_configuration_s_numbers():
