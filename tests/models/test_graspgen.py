@@ -1,0 +1,97 @@
+"""The diffusion sampler with the weights that ship."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from models.graspgen.labels import GRIPPERS, check_grasps
+from models.graspgen.sampler import DiffusionConfig, DiffusionSampler
+from models.graspgen.shapes import make_shape
+from models.graspgen.views import ViewConfig, render_view
+from models.graspgen.weights import WeightsError
+
+VIEW = ViewConfig(occluded_share=0.0, flying_share=0.0)
+
+
+@pytest.fixture(scope="module")
+def sampler() -> DiffusionSampler:
+    return DiffusionSampler()
+
+
+def a_bottle(seed: int):
+    rng = np.random.default_rng(seed)
+    solid = make_shape("bottle", rng)
+    seen = render_view(solid, VIEW, rng)
+    assert seen is not None
+    return solid, *seen
+
+
+def test_grasps_are_proper_scored_and_best_first(sampler):
+    grasps = sampler.sample(a_bottle(0)[1], 100, 0)
+    R = grasps.T_camera_grasps[:, :3, :3]
+    assert len(grasps) == 100
+    assert R @ R.transpose(0, 2, 1) == pytest.approx(np.tile(np.eye(3), (100, 1, 1)), abs=1e-6)
+    assert np.linalg.det(R) == pytest.approx(1.0)
+    assert (np.diff(grasps.scores) <= 0.0).all()
+    assert grasps.scores.min() >= 0.0 and grasps.scores.max() <= 1.0
+    assert grasps.widths_m.min() > 0.0
+
+
+def test_the_same_seed_gives_the_same_grasps_and_another_seed_others(sampler):
+    points = a_bottle(0)[1]
+    first, again, other = (sampler.sample(points, 50, seed) for seed in (3, 3, 4))
+    assert np.array_equal(first.T_camera_grasps, again.T_camera_grasps)
+    assert np.array_equal(first.scores, again.scores)
+    assert not np.allclose(first.T_camera_grasps, other.T_camera_grasps)
+
+
+def test_turning_the_camera_turns_the_grasps_and_nothing_else(sampler):
+    points = a_bottle(1)[1]
+    R = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
+    R *= np.linalg.det(R)
+    grasps, turned = sampler.sample(points, 60, 0), sampler.sample(points @ R.T, 60, 0)
+    assert turned.scores == pytest.approx(grasps.scores, abs=1e-3)
+    assert turned.T_camera_grasps[:10, :3, :3] == pytest.approx(R @ grasps.T_camera_grasps[:10, :3, :3], abs=2e-3)
+
+
+def test_most_grasps_of_unseen_bottles_hold_and_the_best_scored_more_than_the_worst(sampler):
+    raw, best, worst, width_errors = [], [], [], []
+    for seed in range(50, 60):
+        solid, points, T_camera_object = a_bottle(seed)
+        grasps = sampler.sample(points, 200, 0)
+        check = check_grasps(solid, np.linalg.inv(T_camera_object) @ grasps.T_camera_grasps, GRIPPERS["agnostic"])
+        raw.append(check.valid.mean())
+        best.append(check.valid[:50].mean())
+        worst.append(check.valid[-50:].mean())
+        width_errors.append(np.median(np.abs(grasps.widths_m - check.widths_m)[check.valid]))
+    assert np.mean(raw) > 0.7
+    assert np.mean(best) > np.mean(worst) + 0.1
+    assert np.median(width_errors) < 0.012
+
+
+@pytest.mark.parametrize(
+    ("points", "message"),
+    [
+        (np.zeros((5, 3)), "30 points"),
+        (np.full((100, 3), np.nan), "NaN"),
+        (np.tile([0.0, 0.0, 0.4], (100, 1)), "spans"),
+        (np.random.default_rng(0).normal(size=(100, 3)) * 30.0, "millimetres"),
+    ],
+)
+def test_clouds_that_cannot_be_grasped_are_refused(sampler, points, message):
+    with pytest.raises(ValueError, match=message):
+        sampler.sample(points, 10, 0)
+
+
+def test_nonsense_settings_and_missing_weights_are_refused(tmp_path):
+    with pytest.raises(ValueError, match="steps"):
+        DiffusionConfig(steps=0)
+    with pytest.raises(WeightsError, match="missing"):
+        DiffusionSampler(DiffusionConfig(weights=tmp_path / "none.npz"))
+
+
+def test_torch_is_not_imported_until_the_sampler_is_made():
+    code = "import sys, z1_runtime.assembly, models.graspgen.sampler; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
