@@ -93,6 +93,20 @@ Measured on the ten hardest of the 81 scenario views: none touches the border of
 """
 
 
+CAMERA_HOUSING_LOW = _constant(-0.012, -0.021, -0.0193)
+"""(3,) lower corner of the D405's housing in the camera frame [m] (datasheet: 42 × 42 × 23 mm, left imager 9 mm left
+of its middle and 3.7 mm behind its front glass)."""
+CAMERA_HOUSING_HIGH = _constant(0.030, 0.021, 0.0037)
+"""(3,) upper corner of the same [m]."""
+BRACKET_FOOT = _constant(0.020, 0.030, 0.009)
+"""(3,) where the bracket, a plate, stands on the flange's skin (radius 32.5 mm), flange frame [m]."""
+BRACKET_HEAD = T_FLANGE_CAMERA[:3, :3] @ np.array([0.009, 0.0, -0.0220]) + T_FLANGE_CAMERA[:3, 3]
+"""(3,) where it meets the housing's back, flange frame [m]."""
+BRACKET_HEAD.setflags(write=False)
+BRACKET_HALF_WIDTH_M = 0.015
+"""Half its width, along the flange's z [m]."""
+
+
 @cache
 def urdf_path() -> Path:
     """Return the path of the Z1's URDF (with gripper) inside the `example-robot-data` wheel.

@@ -36,7 +36,6 @@ more than the real arm's repeatability; the gripper's 1.0 Nm would be a third of
 ARMATURE = (0.02, 0.04, 0.02, 0.02, 0.02, 0.02, 0.005)
 """(7,) inertia of the rotors behind their gears [kg m²]: not published; of the size of geared drives of 30 Nm."""
 
-_HOUSING_M = (0.042, 0.042, 0.023)  # D405: width, height, depth (datasheet)
 _HOUSING_MASS_KG = 0.060
 _BRACKET_MASS_KG = 0.040
 _LINK_RGBA = {"link": (0.80, 0.83, 0.87, 1.0), "dark": (0.16, 0.18, 0.22, 1.0), "jaw": (0.13, 0.14, 0.16, 1.0)}
@@ -159,11 +158,7 @@ def _add_geoms(spec: mujoco.MjSpec, body: mujoco.MjsBody, name: str) -> None:
 
 
 def _add_mount(flange: mujoco.MjsBody) -> None:
-    """Add the D405's housing, its bracket and the camera.
-
-    The left imager lies 9 mm left of the housing's centre and 3.7 mm behind the front glass (datasheet), so the
-    housing's centre is 9 mm to the right and 7.8 mm behind it. The bracket stands on the flange's +y side.
-    """
+    """Add the D405's housing, its bracket (on the flange's +y side) and the camera."""
     pose = z1.T_FLANGE_CAMERA
     quat = np.empty(4)
     mujoco.mju_mat2Quat(quat, pose[:3, :3].ravel().copy())
@@ -174,25 +169,23 @@ def _add_mount(flange: mujoco.MjsBody) -> None:
         "conaffinity": BIT_SCENE | BIT_BASE,
         "type": mujoco.mjtGeom.mjGEOM_BOX,
     }
-    half = np.array(_HOUSING_M) / 2
     camera.add_geom(
         name="camera_housing",
-        size=half,
-        pos=[0.009, 0.0, 0.0037 - half[2]],
+        size=(z1.CAMERA_HOUSING_HIGH - z1.CAMERA_HOUSING_LOW) / 2,
+        pos=(z1.CAMERA_HOUSING_HIGH + z1.CAMERA_HOUSING_LOW) / 2,
         mass=_HOUSING_MASS_KG,
         material="camera",
         **common,
     )
-    # A printed plate of 8 mm, 36 g with its screws 40, from the flange's skin (radius 32.5 mm) to the housing's back.
-    foot, head = np.array([0.020, 0.030, 0.009]), pose[:3, :3] @ [0.009, 0.0, -0.0220] + pose[:3, 3]
-    middle, along = (foot + head) / 2, head - foot
+    # A printed plate of 8 mm, 36 g; with its screws 40
+    middle, along = (z1.BRACKET_FOOT + z1.BRACKET_HEAD) / 2, z1.BRACKET_HEAD - z1.BRACKET_FOOT
     angle = np.arctan2(-along[0], along[1])
     bracket = flange.add_body(
         name="camera_bracket", pos=middle, quat=[np.cos(angle / 2), 0.0, 0.0, np.sin(angle / 2)], gravcomp=1.0
     )
     bracket.add_geom(
         name="camera_bracket",
-        size=[0.004, np.linalg.norm(along) / 2, 0.015],
+        size=[0.004, np.linalg.norm(along) / 2, z1.BRACKET_HALF_WIDTH_M],
         mass=_BRACKET_MASS_KG,
         material="bracket",
         **common,

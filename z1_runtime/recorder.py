@@ -101,7 +101,7 @@ def _check_free(port: int) -> None:
 def _open_viewer(port: int) -> None:
     url = f"rerun+http://{LOOPBACK}:{port}/proxy"
     if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        logger.warning("no screen here: look at the live view with `rerun %s`", url)
+        logger.warning("no screen here: look at the live view with `.venv/bin/rerun %s`", url)
         return
     # Given a URL the viewer only connects; bound to the loopback it could not be reached from outside anyway.
     command = [sys.executable, "-m", "rerun", "--bind", LOOPBACK, url]

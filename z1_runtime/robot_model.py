@@ -45,12 +45,6 @@ SELF_PAIRS = (
 GRIPPER_OBSTACLES = ("link00", "link01", "link02", "link03")
 """Links that gripper and camera can meet."""
 
-# D405 datasheet: 42 × 42 × 23 mm. The left imager sits 9 mm left of the middle, 3.7 mm behind the front glass
-_CAMERA_LOW = np.array([-0.012, -0.021, -0.0193])
-_CAMERA_HIGH = np.array([0.030, 0.021, 0.0037])
-# Our mount: a 30 mm wide plate from the wrist's shell to the camera's back
-_BRACKET_FOOT = np.array([0.030, 0.0325, 0.0])
-_BRACKET_HALF_WIDTH_M = 0.015
 _SPACING_M = 0.0085
 _JAW_SPACING_M = 0.005  # jaws pass the object within millimetres, and its edges must not slip between two points
 
@@ -80,7 +74,9 @@ def gripper_shape(spacing_m: float = _SPACING_M) -> GripperShape:
     # The housing is hollow; nothing gets inside without crossing what surrounds it
     inside = (np.hypot(stator[:, 0], stator[:, 2]) < PALM_RADIUS_M - 0.002) & (np.abs(stator[:, 1]) < 0.026)
     wrist = _moved(T_pivot_flange, _mesh_surface("z1_Link06", spacing_m))
-    camera = _moved(T_pivot_flange @ z1.T_FLANGE_CAMERA, _box_surface(_CAMERA_LOW, _CAMERA_HIGH, spacing_m))
+    camera = _moved(
+        T_pivot_flange @ z1.T_FLANGE_CAMERA, _box_surface(z1.CAMERA_HOUSING_LOW, z1.CAMERA_HOUSING_HIGH, spacing_m)
+    )
     bracket = _moved(T_pivot_flange, _bracket(spacing_m))
     fixed = np.concatenate([stator[~inside], wrist, camera, bracket])
     mover = _mesh_surface("z1_GripperMover", _JAW_SPACING_M)
@@ -123,9 +119,7 @@ def _box_surface(low: np.ndarray, high: np.ndarray, spacing_m: float) -> np.ndar
 
 def _bracket(spacing_m: float) -> np.ndarray:
     """Return a grid over the plate between wrist and camera, in the flange frame."""
-    back = z1.T_FLANGE_CAMERA[:3, :3] @ np.array([0.0, 0.0, _CAMERA_LOW[2]]) + z1.T_FLANGE_CAMERA[:3, 3]
-    n_along = int(np.ceil(np.linalg.norm(back - _BRACKET_FOOT) / spacing_m)) + 1
-    n_across = int(np.ceil(2.0 * _BRACKET_HALF_WIDTH_M / spacing_m)) + 1
-    along = np.linspace(0.0, 1.0, n_along)[:, None, None]
-    across = np.linspace(-_BRACKET_HALF_WIDTH_M, _BRACKET_HALF_WIDTH_M, n_across)[None, :, None]
-    return (_BRACKET_FOOT + along * (back - _BRACKET_FOOT) + across * np.array([0.0, 0.0, 1.0])).reshape(-1, 3)
+    rise, half_width = z1.BRACKET_HEAD - z1.BRACKET_FOOT, z1.BRACKET_HALF_WIDTH_M
+    along = np.linspace(0.0, 1.0, int(np.ceil(np.linalg.norm(rise) / spacing_m)) + 1)[:, None, None]
+    across = np.linspace(-half_width, half_width, int(np.ceil(2.0 * half_width / spacing_m)) + 1)[None, :, None]
+    return (z1.BRACKET_FOOT + along * rise + across * np.array([0.0, 0.0, 1.0])).reshape(-1, 3)
