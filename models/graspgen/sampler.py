@@ -24,7 +24,7 @@ class DiffusionConfig:
     """The hand the weights were trained for; they lie in `models/weights/graspgen_<gripper>.npz`."""
     weights: Path | None = None
     """Another weights file, its checksum beside it."""
-    steps: int = 8
+    steps: int = 6
     """Denoising steps."""
     temperature: float = 1.0
     """Spread of the starting noise; below 1 grasps are safer and less varied."""

@@ -32,7 +32,7 @@ class TrainingConfig:
     grasps_per_view: int = 72
     discriminator_iterations: int = 2400
     discriminator_rate: float = 1.0e-3
-    judged_views: int = 2400
+    judged_views: int = 6400
     """Views whose samples the exact check labels."""
     samples_per_view: int = 64
     """Of the generator's own."""
