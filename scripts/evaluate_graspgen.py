@@ -73,6 +73,8 @@ def main(config: Config) -> None:
     report["latency_threads"] = config.latency_threads
     if config.generator == "diffusion":
         report["sampling"] = {k: v for k, v in asdict(config.diffusion).items() if k in ("steps", "temperature")}
+        weights = config.diffusion.weights or weights_path(config.gripper)
+        report["weights_sha256"] = weights.with_suffix(".sha256").read_text().split()[0]
     for name, families in (("known families", KNOWN_FAMILIES), ("unseen families", UNSEEN_FAMILIES)):
         for condition, view in CONDITIONS.items():
             clouds = [
@@ -188,7 +190,9 @@ def summarise(clouds: list[CloudResult]) -> dict:
         **{key: _mean(values) for key, values in top.items()},
         "coverage": _mean([c.coverage for c in clouds]),
         "auc": round(area_under_curve(scores, valid), 3),
-        "auc_within_cloud": _mean([area_under_curve(c.scores, c.valid) for c in clouds if 0 < c.valid.mean() < 1]),
+        "auc_within_cloud": _mean(
+            [area_under_curve(c.scores, c.valid) for c in clouds if 0 < c.valid.sum() < len(c.valid)]
+        ),
         "frontal_share": _mean(frontal),
         "frontal_valid": _mean(frontal_valid),
         "clouds_with_5_frontal_valid": _mean([np.sum(c.valid & c.frontal) >= 5 for c in clouds]),
