@@ -78,7 +78,7 @@ class Player:
         self.bench.arm.block(joint)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.lists(events, min_size=1, max_size=8))
 def test_no_step_is_faster_than_the_joints_and_no_setpoint_is_outside_their_limits(drawn: list[tuple]) -> None:
     player = Player()

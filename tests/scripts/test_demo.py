@@ -27,6 +27,14 @@ TIMES = ("stage_ms", "servo", "zenoh")
 SERVER_PERIOD_S = 0.010
 
 
+@pytest.fixture(scope="module", autouse=True)
+def heed_ctrl_c() -> Iterator[None]:
+    """A suite started in the background of a shell ignores Ctrl-C, and would hand that down to its children."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 def free_port() -> int:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
@@ -133,7 +141,7 @@ def demo_in_motion(out: Path) -> tuple[subprocess.Popen[str], int]:
         if "decide" in line:
             break
     children = Path(f"/proc/{demo.pid}/task/{demo.pid}/children").read_text().split()
-    (hal,) = [int(child) for child in children if b"scripts.cli" in Path(f"/proc/{child}/cmdline").read_bytes()]
+    (hal,) = [int(child) for child in children if b"\0hal\0" in Path(f"/proc/{child}/cmdline").read_bytes()]
     return demo, hal
 
 

@@ -73,7 +73,7 @@ def test_link_poses_start_at_the_base_and_turn_the_mover_about_the_pivot() -> No
     np.testing.assert_allclose(opened["gripperStator"], closed["gripperStator"], atol=1e-12)
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(FRACTIONS)
 def test_the_jacobian_is_the_derivative_of_the_pivot(fraction: np.ndarray) -> None:
     q, h = arm_joints(fraction), 1e-6
@@ -83,7 +83,7 @@ def test_the_jacobian_is_the_derivative_of_the_pivot(fraction: np.ndarray) -> No
     np.testing.assert_allclose(KINEMATICS.jacobian(q), np.transpose(numeric), atol=1e-7)
 
 
-@settings(deadline=None, max_examples=300)
+@settings(max_examples=300)
 @given(FRACTIONS)
 def test_every_branch_reaches_the_pose_inside_the_limits(fraction: np.ndarray) -> None:
     T = KINEMATICS.pivot(arm_joints(fraction))

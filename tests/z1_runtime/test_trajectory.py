@@ -50,7 +50,7 @@ def assert_sound(motion: JointTrajectory, limits: MotionLimits) -> None:
     np.testing.assert_allclose(np.diff(motion.q, axis=0) / dt, midpoint, atol=1e-3)
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(FRACTIONS, FRACTIONS, SPEEDS)
 def test_a_joint_move_goes_straight_and_keeps_all_limits(start: np.ndarray, goal: np.ndarray, speed: float) -> None:
     q_start, q_goal, limits = joints(start), joints(goal), MotionLimits.at_speed(speed)
@@ -74,7 +74,7 @@ def test_a_joint_move_is_as_fast_as_its_slowest_limit() -> None:
     assert by_hand <= motion.duration_s <= by_hand + z1.CONTROL_PERIOD_S
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(
     hnp.arrays(np.float64, 6, elements=st.floats(-0.2, 0.2)),
     hnp.arrays(np.float64, 3, elements=st.floats(-0.06, 0.06)),
@@ -143,7 +143,7 @@ def test_a_straight_move_to_where_the_pivot_is_moves_the_gripper_alone() -> None
     assert motion.q[-1, -1] == -0.4
 
 
-@settings(deadline=None, max_examples=15)
+@settings(max_examples=15)
 @given(st.lists(FRACTIONS, min_size=2, max_size=4))
 def test_a_joint_path_stops_at_each_point(fractions: list[np.ndarray]) -> None:
     qs = np.stack([joints(fraction) for fraction in fractions])
@@ -176,7 +176,7 @@ def test_moving_to_where_the_arm_is_takes_one_period() -> None:
     np.testing.assert_array_equal(motion.q, [Q_READY, Q_READY])
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(FRACTIONS, FRACTIONS, st.sampled_from([0.02, 0.1, 0.2]))
 def test_the_pieces_of_a_motion_cover_every_sample_once(start: np.ndarray, goal: np.ndarray, length_s: float) -> None:
     motion = trajectory.joint_move(joints(start), joints(goal))
