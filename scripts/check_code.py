@@ -25,7 +25,8 @@ def main(config: CheckConfig) -> int:
     """Run all checks, even after one failed; return 1 if any did."""
     lint = ["ruff", "check", *(["--fix"] if config.fix else [])]
     layout = ["ruff", "format", *([] if config.fix else ["--check"])]
-    failed = [step for step in (lint, layout, ["pyright"]) if not _passes(step)]
+    types = ["pyright", "--level", "error"]  # warnings tell of modules without stubs
+    failed = [step for step in (lint, layout, types) if not _passes(step)]
     for step in failed:
         print(f"error: `{' '.join(step)}` found something; see above.", file=sys.stderr)
     return 1 if failed else 0
