@@ -8,9 +8,8 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from models.surfels import Surfels, estimate_normals, find_outline, guess_hidden_sides, smooth_normals
-from models.types import GraspSet
+from models.types import GraspSet, check_request
 
-_MIN_POINTS = 30
 _CHUNK_HANDS = 256  # keeps a batch of hands × points inside the cache
 
 
@@ -89,7 +88,7 @@ class AntipodalSampler:
             ValueError: fewer than 30 points, points not finite or all on one line, or no two of them can be
                 touched from opposite sides within the opening.
         """
-        points = _checked(points, n)
+        points = check_request(points, n)
         rng = np.random.default_rng(seed)
         surfels = self._find_surfels(points, rng)
         hands = self._draw_hands(surfels, points, int(np.ceil(n * self.config.oversampling)), rng)
@@ -174,17 +173,6 @@ class AntipodalSampler:
         T[:, :3, :3] = np.stack([np.cross(y_axis, z_axis), y_axis, z_axis], axis=2)
         T[:, :3, 3] = hands.centers[chosen] + hands.depths[chosen, None] * z_axis
         return GraspSet(T_camera_grasps=T, scores=scores[chosen], widths_m=hands.widths[chosen], source="antipodal")
-
-
-def _checked(points: np.ndarray, n: int) -> np.ndarray:
-    points = np.asarray(points, dtype=np.float64)
-    if n < 1:
-        raise ValueError(f"Asked for {n} grasps; ask for one or more.")
-    if points.ndim != 2 or points.shape[1] != 3 or len(points) < _MIN_POINTS:
-        raise ValueError(f"Grasps need a cloud (M, 3) of {_MIN_POINTS} points or more; got {points.shape}.")
-    if not np.isfinite(points).all():
-        raise ValueError("The cloud holds points that are NaN or infinite; drop invalid depth first.")
-    return points
 
 
 def _antipodal_pairs(surfels: Surfels, config: AntipodalConfig) -> tuple[np.ndarray, np.ndarray]:

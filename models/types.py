@@ -71,3 +71,23 @@ class GraspGenerator(Protocol):
             ValueError: too few points, or points that are not finite.
         """
         ...
+
+
+MIN_CLOUD_POINTS = 30
+"""Fewest points a grasp generator takes."""
+
+
+def check_request(points: np.ndarray, n: int) -> np.ndarray:
+    """Return `points` as float64 (M, 3), if a generator can be asked for `n` grasps on them.
+
+    Raises:
+        ValueError: `n` is below one, too few points, another shape, or points that are not finite.
+    """
+    points = np.asarray(points, dtype=np.float64)
+    if n < 1:
+        raise ValueError(f"Asked for {n} grasps; ask for one or more.")
+    if points.ndim != 2 or points.shape[1] != 3 or len(points) < MIN_CLOUD_POINTS:
+        raise ValueError(f"Grasps need a cloud (M, 3) of {MIN_CLOUD_POINTS} points or more; got {points.shape}.")
+    if not np.isfinite(points).all():
+        raise ValueError("The cloud holds points that are NaN or infinite; drop invalid depth first.")
+    return points

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -15,9 +16,11 @@ from models.mvbb import RankedGrasps, fit_obb, rank_grasps
 from models.types import GraspGenerator, GraspSet
 from z1_runtime.config import RuntimeConfig
 from z1_runtime.kinematics import Kinematics
-from z1_runtime.perception import Perception
+from z1_runtime.perception import Perception, PerceptionError
 from z1_runtime.planner import GraspPlanner, NoPlanError
 from z1_runtime.types import GraspPlan, Observation
+
+_LOG = logging.getLogger(__name__)
 
 
 class StageTimes:
@@ -115,7 +118,10 @@ class Decider:
     def warm_up(self) -> None:
         """Decide once on a drawn scene, so that the first real frame does not wait for compilers and caches."""
         q = np.append(z1.Q_HOME, self.config.jaw_home)
-        self.decide(draw_can(self.kinematics.flange(z1.Q_HOME) @ self.T_flange_camera), q)
+        try:
+            self.decide(draw_can(self.kinematics.flange(z1.Q_HOME) @ self.T_flange_camera), q)
+        except (PerceptionError, NoPlanError) as error:  # what cannot be done there may be possible here
+            _LOG.info("the warm-up scene has no plan under this configuration: %s", error)
 
 
 def draw_can(T_base_camera: np.ndarray, radius_m: float = 0.03, height_m: float = 0.15) -> RgbdFrame:
@@ -144,4 +150,5 @@ def draw_can(T_base_camera: np.ndarray, radius_m: float = 0.03, height_m: float 
         intrinsics=intrinsics,
         stamp_s=0.0,
         sequence=0,
+        truth_mask=np.fmin(side, lid) < table,
     )

@@ -95,11 +95,6 @@ class HalServer:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    @property
-    def uses_shared_memory(self) -> bool:
-        """Whether frames go through shared memory."""
-        return self._buffers.shared
-
     def close(self) -> None:
         """Answer nobody any more, end all threads, leave nothing in shared memory. Harmless when done before."""
         if self._closing.is_set():

@@ -10,9 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from models.graspgen.cloud import prepare_cloud
-from models.types import GraspSet
+from models.types import GraspSet, check_request
 
-_MIN_POINTS = 30
 _LARGEST_OBJECT_M = 1.0
 
 
@@ -128,13 +127,7 @@ def _single_threaded_workers(count: int) -> ThreadPoolExecutor:
 
 
 def _checked(points: np.ndarray, n: int) -> np.ndarray:
-    points = np.asarray(points, dtype=np.float64)
-    if n < 1:
-        raise ValueError(f"Asked for {n} grasps; ask for one or more.")
-    if points.ndim != 2 or points.shape[1] != 3 or len(points) < _MIN_POINTS:
-        raise ValueError(f"Grasps need a cloud (M, 3) of {_MIN_POINTS} points or more; got {points.shape}.")
-    if not np.isfinite(points).all():
-        raise ValueError("The cloud holds points that are NaN or infinite; drop invalid depth first.")
+    points = check_request(points, n)
     extent = float(np.ptp(points, axis=0).max())
     if not 0.002 < extent < _LARGEST_OBJECT_M:
         raise ValueError(

@@ -111,7 +111,7 @@ def test_a_detector_that_needs_the_twin_is_told_apart(decider, T_base_camera):
     blind = make_decider(replace(CONFIG, detector="truth"))
     assert isinstance(blind.perception._detector, TruthDetector)
     with pytest.raises(PerceptionError, match="--detector tabletop"):
-        blind.decide(draw_can(T_base_camera), Q)
+        blind.decide(replace(draw_can(T_base_camera), truth_mask=None), Q)
 
 
 def nan_in_the_middle(points: np.ndarray) -> np.ndarray:
@@ -155,8 +155,21 @@ def test_candidates_that_all_come_from_behind_leave_no_plan(decider, decision, T
         with_part(decider, generator=FromBehind()).decide(draw_can(T_base_camera), Q)
 
 
-def test_warming_up_decides_without_a_camera(decider):
-    decider.warm_up()
+@pytest.mark.parametrize("detector", ["tabletop", "truth"])
+def test_warming_up_decides_without_a_camera_whichever_the_detector(detector, caplog):
+    with caplog.at_level("INFO", "z1_runtime.decision"):
+        make_decider(replace(RuntimeConfig(), detector=detector)).warm_up()
+    assert not caplog.records
+
+
+def test_a_configuration_that_cannot_grasp_the_warm_up_scene_is_told_at_the_real_one(T_base_camera, caplog):
+    config = RuntimeConfig()
+    high = make_decider(replace(config, planner=replace(config.planner, lift_m=0.5)))
+    with caplog.at_level("INFO", "z1_runtime.decision"):
+        high.warm_up()
+    assert "no plan" in caplog.text
+    with pytest.raises(NoPlanError):
+        high.decide(draw_can(T_base_camera), np.append(z1.Q_HOME, -1.0))
 
 
 def test_stage_times_add_up_by_name_and_keep_what_an_error_cost():
