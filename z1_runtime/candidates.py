@@ -59,6 +59,10 @@ class Candidates:
         """Return the mover angle at which candidate `rank` is touched [rad]."""
         return float(self._chunks[rank // _CHUNK][0].jaw_contact[rank % _CHUNK])
 
+    def free(self) -> np.ndarray:
+        """Return (N,) whether a flip of each candidate hits nothing at the grasp."""
+        return np.array([not isinstance(self.ways(rank), Problem) for rank in range(len(self))], dtype=bool)
+
     def ways(self, rank: int) -> list[Way] | Problem:
         """Return the flips of candidate `rank` that hit nothing at the grasp, or why there is none."""
         if rank // _CHUNK not in self._chunks:

@@ -89,31 +89,58 @@ class Decider:
             ValueError: the generator can make nothing of the cloud, such as an object wider than any opening.
             NoPlanError: no candidate can be executed; the message counts why.
         """
-        config = self.config
         times = StageTimes()
         with times.stage("total"):
-            jaw = float(q[-1])
-            T_base_camera = self.kinematics.flange(q[: z1.N_ARM]) @ self.T_flange_camera
-            with times.stage("detect"):
-                detection = self.perception.detect(frame, T_base_camera, jaw)
-            with times.stage("cloud"):
-                observation = self.perception.segment(frame, T_base_camera, jaw, detection)
+            observation = self.observe(frame, q, times)
             with times.stage("generate"):
-                candidates = self.generator.sample(observation.object_points, config.n_candidates, config.seed)
+                candidates = self.propose(observation)
             with times.stage("mvbb"):
-                up = T_base_camera[2, :3]  # the base's z axis, seen from the camera
-                box = fit_obb(observation.object_points, config.box_method, up=up)
-                ranked = rank_grasps(candidates, box, k=config.k_faces, alpha=config.alpha)
-            if not len(ranked):
-                raise NoPlanError(
-                    f"none of {len(candidates)} candidates comes at one of the {config.k_faces} nearest faces of the "
-                    "object's box; raise k_faces or n_candidates, or look from another side.",
-                    rejections=(),
-                )
+                ranked = self.rank(candidates, observation)
             plan = self.planner.plan(ranked.grasps, observation, q, times.stage)  # ik, collision, plan
         return Decision(
             observation=observation, candidates=candidates, ranked=ranked, plan=plan, stage_ms=dict(times.ms)
         )
+
+    def observe(self, frame: RgbdFrame, q: np.ndarray, times: StageTimes | None = None) -> Observation:
+        """Return what `frame`, taken at joint positions `q` (7,), shows; `times` gets the stages detect and cloud.
+
+        Raises:
+            PerceptionError: nothing usable was seen.
+        """
+        times = times or StageTimes()
+        jaw = float(q[-1])
+        T_base_camera = self.kinematics.flange(q[: z1.N_ARM]) @ self.T_flange_camera
+        with times.stage("detect"):
+            detection = self.perception.detect(frame, T_base_camera, jaw)
+        with times.stage("cloud"):
+            return self.perception.segment(frame, T_base_camera, jaw, detection)
+
+    def propose(self, observation: Observation) -> GraspSet:
+        """Return the generator's candidates for the object, in the camera frame.
+
+        Raises:
+            ValueError: the generator can make nothing of the cloud.
+        """
+        return self.generator.sample(observation.object_points, self.config.n_candidates, self.config.seed)
+
+    def rank(self, candidates: GraspSet, observation: Observation) -> RankedGrasps:
+        """Return the candidates that come at one of the nearest faces of the object's box, best first.
+
+        Raises:
+            DegenerateCloudError: the object's cloud spans no box.
+            NoPlanError: none does.
+        """
+        config = self.config
+        up = observation.T_base_camera[2, :3]  # the base's z axis, seen from the camera
+        box = fit_obb(observation.object_points, config.box_method, up=up)
+        ranked = rank_grasps(candidates, box, k=config.k_faces, alpha=config.alpha)
+        if not len(ranked):
+            raise NoPlanError(
+                f"none of {len(candidates)} candidates comes at one of the {config.k_faces} nearest faces of the "
+                "object's box; raise k_faces or n_candidates, or look from another side.",
+                rejections=(),
+            )
+        return ranked
 
     def warm_up(self) -> None:
         """Decide once on a drawn scene, so that the first real frame does not wait for compilers and caches."""
