@@ -173,13 +173,13 @@ KNOWN_FAMILIES = {
 """What training sees."""
 FAMILY_WEIGHTS = {
     "box": 0.17,
-    "cylinder": 0.11,
-    "bottle": 0.12,
-    "capsule": 0.04,
-    "sphere": 0.04,
+    "cylinder": 0.09,
+    "bottle": 0.11,
+    "capsule": 0.03,
+    "sphere": 0.03,
     "cone": 0.06,
-    "cup": 0.09,
-    "l_shape": 0.08,
+    "cup": 0.10,
+    "l_shape": 0.12,
     "lathe": 0.12,
     "union": 0.17,
 }

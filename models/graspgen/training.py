@@ -26,13 +26,13 @@ Progress = Callable[[int, float], None]
 class TrainingConfig:
     """How long and how fast; the recipe that is written beside the weights."""
 
-    generator_iterations: int = 5000
+    generator_iterations: int = 15000
     generator_rate: float = 1.5e-3
     views_per_batch: int = 20
     grasps_per_view: int = 72
-    discriminator_iterations: int = 2400
+    discriminator_iterations: int = 5000
     discriminator_rate: float = 1.0e-3
-    judged_views: int = 6400
+    judged_views: int = 10000
     """Views whose samples the exact check labels."""
     samples_per_view: int = 64
     """Of the generator's own."""

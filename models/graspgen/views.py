@@ -30,9 +30,9 @@ class ViewConfig:
     """Share of objects that stand; of the rest half are tilted by up to 40°, half lie anyhow."""
     one_face_share: float = 0.2
     """Share of views square to an object's x or y side."""
-    occluded_share: float = 0.3
+    occluded_share: float = 0.4
     """Share of views with a part hidden."""
-    hidden: tuple[float, float] = (0.1, 0.4)
+    hidden: tuple[float, float] = (0.1, 0.45)
     """Range of the hidden part of the points."""
     noise_per_m: tuple[float, float] = (0.002, 0.010)
     """Range of the depth noise's standard deviation over the squared distance [1/m]; 0.2 to 0.9 mm at 0.3 m."""
