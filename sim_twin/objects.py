@@ -62,8 +62,13 @@ class GraspObject:
         return np.vstack([part.corners() for part in self.parts])
 
 
-def _lathe(profile: tuple[tuple[float, float], ...], parts: tuple[tuple[float, tuple], ...]) -> tuple[Part, ...]:
-    """Return one part per segment of a profile of (height, radius) [m], heights from the foot."""
+def lathe(profile: tuple[tuple[float, float], ...], parts: tuple[tuple[float, tuple], ...]) -> tuple[Part, ...]:
+    """Return one part per segment of a profile of (height, radius) [m], heights from the foot.
+
+    Args:
+        profile: corner points, from the foot up.
+        parts: (mass_kg, rgba) of each segment.
+    """
     middle = profile[-1][0] / 2
     made = []
     for (z0, r0), (z1, r1), (mass_kg, rgba) in zip(profile[:-1], profile[1:], parts, strict=True):
@@ -89,7 +94,7 @@ OBJECTS: dict[str, GraspObject] = {
     # moves the centre of mass by a few millimetres.
     "bottle": GraspObject(
         height_m=0.200,
-        parts=_lathe(
+        parts=lathe(
             _BOTTLE_PROFILE,
             ((0.014, _PET), (0.199, _PET), (0.076, _LABEL), (0.005, _PET), (0.003, _PET), (0.003, _CAP)),
         ),

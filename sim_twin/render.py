@@ -14,6 +14,7 @@ import numba
 import numpy as np
 
 from hal.messages import Intrinsics
+from sim_twin.board import BoardSpec
 from sim_twin.gl import Canvas, choose
 from sim_twin.objects import OBJECT_BODY
 from sim_twin.z1_mjcf import GROUP_ARM, GROUP_SCENE
@@ -45,13 +46,16 @@ class WristRenderer(Protocol):
         ...
 
 
-def make_renderer(model: mujoco.MjModel, intrinsics: Intrinsics, kind: str | None = None) -> WristRenderer:
+def make_renderer(
+    model: mujoco.MjModel, intrinsics: Intrinsics, kind: str | None = None, board: BoardSpec | None = None
+) -> WristRenderer:
     """Return a renderer for the calling thread.
 
     Args:
         model: the scene.
         intrinsics: of the wrist camera.
         kind: one of `sim_twin.gl.RENDERERS`; by default what the environment variable says.
+        board: that lies on the scene's table; rays know no textures.
 
     Raises:
         ValueError: no such kind.
@@ -59,7 +63,7 @@ def make_renderer(model: mujoco.MjModel, intrinsics: Intrinsics, kind: str | Non
     """
     from sim_twin.rays import RayRenderer
 
-    return choose(kind, lambda: EglRenderer(model, intrinsics), lambda: RayRenderer(model, intrinsics))
+    return choose(kind, lambda: EglRenderer(model, intrinsics), lambda: RayRenderer(model, intrinsics, board))
 
 
 def camera_id(model: mujoco.MjModel) -> int:
@@ -70,6 +74,18 @@ def camera_id(model: mujoco.MjModel) -> int:
 def object_geoms(model: mujoco.MjModel) -> np.ndarray:
     """Return which geoms (ngeom,) bool are the object's."""
     return model.geom_bodyid == model.body(OBJECT_BODY).id
+
+
+def set_pinhole(scene: mujoco.MjvScene, intrinsics: Intrinsics) -> None:
+    """Give OpenGL the pinhole: pixel centres are at whole numbers here and at halves there."""
+    i = intrinsics
+    for side in range(2):
+        camera = scene.camera[side]
+        camera.frustum_near, camera.frustum_far = _NEAR_M, _FAR_M
+        camera.frustum_width = _NEAR_M * i.width / i.fx / 2
+        camera.frustum_center = _NEAR_M * (i.width / 2 - (i.cx + 0.5)) / i.fx
+        camera.frustum_top = _NEAR_M * (i.cy + 0.5) / i.fy
+        camera.frustum_bottom = -_NEAR_M * (i.height - i.cy - 0.5) / i.fy
 
 
 class EglRenderer:
@@ -99,7 +115,7 @@ class EglRenderer:
         """Draw the state `data` (kinematics computed)."""
         category = mujoco.mjtCatBit.mjCAT_ALL.value
         mujoco.mjv_updateScene(self._model, data, self._option, None, self._camera, category, self._scene)
-        self._set_frustum()
+        set_pinhole(self._scene, self._intrinsics)
         z_m, mask = self._draw_depth_and_mask()
         colour = np.empty_like(self._ids)
         self._canvas.draw(self._scene, colour)
@@ -108,17 +124,6 @@ class EglRenderer:
     def close(self) -> None:
         """Free the context."""
         self._canvas.close()
-
-    def _set_frustum(self) -> None:
-        """Give OpenGL the pinhole: pixel centres are at whole numbers here and at halves there."""
-        i = self._intrinsics
-        for side in range(2):
-            camera = self._scene.camera[side]
-            camera.frustum_near, camera.frustum_far = _NEAR_M, _FAR_M
-            camera.frustum_width = _NEAR_M * i.width / i.fx / 2
-            camera.frustum_center = _NEAR_M * (i.width / 2 - (i.cx + 0.5)) / i.fx
-            camera.frustum_top = _NEAR_M * (i.cy + 0.5) / i.fy
-            camera.frustum_bottom = -_NEAR_M * (i.height - i.cy - 0.5) / i.fy
 
     def _draw_depth_and_mask(self) -> tuple[np.ndarray, np.ndarray]:
         by_number = [int(mujoco.mjtRndFlag.mjRND_SEGMENT), int(mujoco.mjtRndFlag.mjRND_IDCOLOR)]
