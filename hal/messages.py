@@ -81,6 +81,8 @@ class RgbdFrame:
     """Mid-exposure time [s]."""
     sequence: int
     """Counts up by one a frame; a gap means lost frames."""
+    serial: str = ""
+    """Serial number of the camera, by which its calibration is found; empty where it tells none."""
     truth_mask: np.ndarray | None = None
     """(H, W) bool, the target object's pixels. Only the twin fills it, for evaluation only."""
 

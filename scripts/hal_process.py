@@ -29,7 +29,7 @@ class HalProcess:
 
     def __init__(self, scene: SceneConfig, bus: BusConfig, log: Path) -> None:
         options = {**asdict(scene), **asdict(bus)}
-        del options["noise"]  # a served camera always has its noise
+        del options["noise"], options["board"]  # a served camera always has its noise; no demo has a board
         arguments = [_option(name, value) for name, value in options.items()]
         self._log, self._ready = log, False
         with log.open("wb") as stderr:

@@ -41,6 +41,12 @@ class Config:
     """Twin: lean about the base's y axis [°]."""
     seed: int = 0
     """Twin: seed of the camera's noise."""
+    mount_error_m: float = 0.0
+    """Twin: how far the camera really sits from where the mount's drawing has it [m]."""
+    mount_error_deg: float = 0.0
+    """Twin: how far it is really turned [°]."""
+    mount_seed: int = 0
+    """Twin: of the direction of both."""
     bus: Annotated[BusConfig, tyro.conf.arg(name="")] = field(default_factory=BusConfig)
     """Where to listen."""
     until_stdin_closes: bool = False
@@ -87,6 +93,9 @@ def make_rig(config: Config) -> Rig:
         lateral_m=config.lateral_m,
         pitch_deg=config.pitch_deg,
         seed=config.seed,
+        mount_error_m=config.mount_error_m,
+        mount_error_deg=config.mount_error_deg,
+        mount_seed=config.mount_seed,
     )
     return RIGS.make("sim", scene=scene)
 

@@ -131,7 +131,9 @@ class TwinCamera:
         give_way = None if isinstance(self.clock, TwinClock) else _give_way
         thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="twin-camera", initializer=give_way)
         try:
-            self._renderer = thread.submit(make_renderer, self.world.model, d405.INTRINSICS, self._kind).result()
+            self._renderer = thread.submit(
+                make_renderer, self.world.model, d405.INTRINSICS, self._kind, self.world.config.board
+            ).result()
             self._thread = thread
             self._expose(sequence=0)
         except BaseException:
@@ -186,6 +188,7 @@ class TwinCamera:
             intrinsics=d405.INTRINSICS,
             stamp_s=stamp_s,
             sequence=self._sequence,
+            serial=self.world.config.camera_serial(),
             truth_mask=view.mask,
         )
 

@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 
 from hal.messages import Intrinsics
+from sim_twin.board import PRINT, BoardSpec, project_print
 from sim_twin.render import View, camera_id, object_geoms
 from sim_twin.z1_mjcf import GROUP_ARM, GROUP_SCENE
 
@@ -63,9 +64,11 @@ class RayCaster:
 
 
 class RayRenderer:
-    """The wrist camera by rays."""
+    """The wrist camera by rays; a `board` on the table is painted over where its print is hit."""
 
-    def __init__(self, model: mujoco.MjModel, intrinsics: Intrinsics) -> None:
+    def __init__(self, model: mujoco.MjModel, intrinsics: Intrinsics, board: BoardSpec | None = None) -> None:
+        self._intrinsics, self._board = intrinsics, board
+        self._print = model.geom(PRINT).id if board is not None else None
         self._caster = RayCaster(model, intrinsics, (GROUP_SCENE, GROUP_ARM))
         self._camera = camera_id(model)
         self._is_object = np.append(object_geoms(model), False)  # geom −1: nothing hit
@@ -77,6 +80,9 @@ class RayRenderer:
         T_base_camera[:3, :3] = data.cam_xmat[self._camera].reshape(3, 3) * [1.0, -1.0, -1.0]
         T_base_camera[:3, 3] = data.cam_xpos[self._camera]
         colour, z_m, geoms = self._caster.cast(data, T_base_camera)
+        if self._board is not None:
+            seen = geoms == self._print
+            colour[seen] = project_print(self._board, self._intrinsics, T_base_camera)[seen][:, None]
         return View(colour=colour, z_m=z_m, mask=self._is_object[geoms])
 
     def close(self) -> None:

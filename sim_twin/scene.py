@@ -6,8 +6,10 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from hal import z1
+from sim_twin.board import BoardSpec, add_board
 from sim_twin.objects import OBJECT_BODY, OBJECT_NAMES, OBJECTS, add_object
 from sim_twin.z1_mjcf import BIT_BASE, BIT_HAND, BIT_SCENE, CONTACT_SOLIMP, CONTACT_SOLREF, GROUP_SCENE, add_z1
 
@@ -19,12 +21,14 @@ FIXTURE = "fixture"
 _DISTANCE_M = (0.30, 0.65)
 _LATERAL_M = (-0.25, 0.25)
 _PITCH_DEG = (-60.0, 60.0)
+_MOUNT_ERROR_M, _MOUNT_ERROR_DEG = (0.0, 0.02), (0.0, 10.0)
+_ASIDE_M = (0.90, -0.50)  # where the object stands, out of reach, when there is a board
 _TABLE_FRICTION = (0.4, 0.005, 0.0001)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SceneConfig:
-    """One object on the table in front of the arm.
+    """One object on the table in front of the arm, or a calibration board.
 
     Raises:
         ValueError: a field is out of its range; the message says what is allowed.
@@ -42,6 +46,14 @@ class SceneConfig:
     """Of the camera's noise."""
     noise: bool = True
     """False gives exact depth (rounded to its unit) and clean colour."""
+    board: BoardSpec | None = None
+    """A calibration board on the table; the object then stands aside."""
+    mount_error_m: float = 0.0
+    """How far the camera really sits from where the mount's drawing has it [m]; only a calibration finds out."""
+    mount_error_deg: float = 0.0
+    """How far it is really turned [°]."""
+    mount_seed: int = 0
+    """Of the direction of both."""
 
     def __post_init__(self) -> None:
         if self.object not in OBJECT_NAMES:
@@ -49,8 +61,12 @@ class SceneConfig:
         _check_range("distance_m", self.distance_m, _DISTANCE_M, "m in front of the base")
         _check_range("lateral_m", self.lateral_m, _LATERAL_M, "m to the side")
         _check_range("pitch_deg", self.pitch_deg, _PITCH_DEG, "degrees of lean")
-        if isinstance(self.seed, bool) or not isinstance(self.seed, int) or not 0 <= self.seed < 2**32:
-            raise ValueError(f"seed is {self.seed!r}; allowed is a whole number from 0 to {2**32 - 1}.")
+        _check_range("mount_error_m", self.mount_error_m, _MOUNT_ERROR_M, "m", "allowed is")
+        _check_range("mount_error_deg", self.mount_error_deg, _MOUNT_ERROR_DEG, "degrees", "allowed is")
+        for name in ("seed", "mount_seed"):
+            seed = getattr(self, name)
+            if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**32:
+                raise ValueError(f"{name} is {seed!r}; allowed is a whole number from 0 to {2**32 - 1}.")
 
     def T_base_object(self) -> np.ndarray:
         """Return the object's pose (4, 4) at the start, its lowest point on the table."""
@@ -59,22 +75,42 @@ class SceneConfig:
         pose = np.eye(4)
         pose[:3, :3] = [[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]]
         lowest = (OBJECTS[self.object].corners() @ pose[2, :3]).min()
-        pose[:3, 3] = [self.distance_m, self.lateral_m, -lowest]
+        where = _ASIDE_M if self.board is not None else (self.distance_m, self.lateral_m)
+        pose[:3, 3] = [*where, -lowest]
         return pose
 
+    def T_flange_camera(self) -> np.ndarray:
+        """Return where the camera really is on the flange (4, 4)."""
+        shift, turn = np.random.default_rng(self.mount_seed).normal(size=(2, 3))
+        pose = z1.T_FLANGE_CAMERA.copy()
+        pose[:3, 3] += self.mount_error_m * shift / np.linalg.norm(shift)
+        rotvec = np.deg2rad(self.mount_error_deg) * turn / np.linalg.norm(turn)
+        pose[:3, :3] = Rotation.from_rotvec(rotvec).as_matrix() @ pose[:3, :3]
+        return pose
 
-def _check_range(name: str, value: float, allowed: tuple[float, float], what: str) -> None:
+    def camera_serial(self) -> str:
+        """Return the camera's serial number: one per mount, so that no calibration is taken for another's."""
+        if not (self.mount_error_m or self.mount_error_deg):
+            return "twin"
+        return f"twin-{1e3 * self.mount_error_m:g}mm-{self.mount_error_deg:g}deg-{self.mount_seed}"
+
+
+def _check_range(
+    name: str, value: float, allowed: tuple[float, float], what: str, why: str = "the arm reaches"
+) -> None:
     if not (isinstance(value, int | float) and allowed[0] <= value <= allowed[1]):  # NaN fails too
-        raise ValueError(f"{name} is {value!r}; the arm reaches {allowed[0]:g} to {allowed[1]:g} {what}.")
+        raise ValueError(f"{name} is {value!r}; {why} {allowed[0]:g} to {allowed[1]:g} {what}.")
 
 
 def build_model(config: SceneConfig) -> mujoco.MjModel:
-    """Compile arm, table and object."""
+    """Compile arm, table, object and, if there is one, the board."""
     spec = mujoco.MjSpec()
     spec.compiler.degree = False
     _set_options(spec)
     _add_surroundings(spec)
-    add_z1(spec)
+    add_z1(spec, config.T_flange_camera())
+    if config.board is not None:
+        add_board(spec, config.board)
     add_object(spec, config.object, config.T_base_object())
     if config.pitch_deg != 0:
         weld = spec.add_equality(name=FIXTURE, type=mujoco.mjtEq.mjEQ_WELD, objtype=mujoco.mjtObj.mjOBJ_BODY)

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from sim_twin.world import World
 
 _TRUTH = "eval/truth"
+_POSES = ("T_base_object", "T_flange_camera", "T_base_board")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -31,6 +32,10 @@ class Truth:
     """(4, 4) its pose."""
     lifted_m: float
     """How much higher its lowest point is than at the start [m]."""
+    T_flange_camera: np.ndarray
+    """(4, 4) where the camera really is."""
+    T_base_board: np.ndarray | None
+    """(4, 4) where the calibration board really is (see `sim_twin.board.BoardSpec`); None where there is none."""
     qpos: np.ndarray
     """(14,) MuJoCo's positions: joints [rad], then the object's position [m] and quaternion (wxyz)."""
 
@@ -41,6 +46,8 @@ def read_truth(world: World) -> Truth:
         object=world.config.object,
         T_base_object=world.T_base_object(),
         lifted_m=world.lifted_m(),
+        T_flange_camera=world.config.T_flange_camera(),
+        T_base_board=None if world.config.board is None else world.config.board.T_base_board(),
         qpos=world.snapshot().qpos.copy(),
     )
 
@@ -67,9 +74,9 @@ class TruthServer:
         truth = read_truth(self._world)
         content = {
             "object": truth.object,
-            "T_base_object": truth.T_base_object.ravel().tolist(),
             "lifted_m": truth.lifted_m,
             "qpos": truth.qpos.tolist(),
+            **{name: None if (pose := getattr(truth, name)) is None else pose.ravel().tolist() for name in _POSES},
         }
         return msgpack.packb(content)  # pyright: ignore[reportReturnType] (its stub is wrong)
 
@@ -96,8 +103,9 @@ class TruthClient:
             raise HalTimeoutError(
                 f"the twin does not answer; only a simulated HAL knows the truth ({error})"
             ) from error
-        T_base_object, qpos = np.array(content.pop("T_base_object")).reshape(4, 4), np.array(content.pop("qpos"))
-        return Truth(T_base_object=T_base_object, qpos=qpos, **content)
+        for name in _POSES:
+            content[name] = None if content[name] is None else np.array(content[name]).reshape(4, 4)
+        return Truth(qpos=np.array(content.pop("qpos")), **content)
 
     def close(self) -> None:
         """Hang up."""

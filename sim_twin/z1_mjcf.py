@@ -45,8 +45,10 @@ def _vector(text: str) -> np.ndarray:
     return np.array([float(part) for part in text.split()])
 
 
-def add_z1(spec: mujoco.MjSpec) -> None:
+def add_z1(spec: mujoco.MjSpec, T_flange_camera: np.ndarray = z1.T_FLANGE_CAMERA) -> None:
     """Add arm, gripper, wrist camera and the seven position servos to `spec`, with link00 at the world's origin.
+
+    The camera with its housing is put at `T_flange_camera` (4, 4).
 
     Bodies are named as the URDF's links and joints as `hal.z1.JOINT_NAMES`. The wrist camera is called `wrist`.
 
@@ -73,7 +75,7 @@ def add_z1(spec: mujoco.MjSpec) -> None:
             index += 1
     spec.add_exclude(name="jaws", bodyname1="gripperStator", bodyname2="gripperMover")
     spec.add_exclude(name="wrist", bodyname1="link06", bodyname2="gripperMover")
-    _add_mount(bodies["link06"])
+    _add_mount(bodies["link06"], T_flange_camera)
 
 
 def _set_inertia(body: mujoco.MjsBody, link: ElementTree.Element) -> None:
@@ -157,9 +159,8 @@ def _add_geoms(spec: mujoco.MjSpec, body: mujoco.MjsBody, name: str) -> None:
         )
 
 
-def _add_mount(flange: mujoco.MjsBody) -> None:
+def _add_mount(flange: mujoco.MjsBody, pose: np.ndarray) -> None:
     """Add the D405's housing, its bracket (on the flange's +y side) and the camera."""
-    pose = z1.T_FLANGE_CAMERA
     quat = np.empty(4)
     mujoco.mju_mat2Quat(quat, pose[:3, :3].ravel().copy())
     camera = flange.add_body(name="camera", pos=pose[:3, 3], quat=quat, gravcomp=1.0)

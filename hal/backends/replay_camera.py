@@ -98,13 +98,14 @@ def save_frames(path: str | Path, frames: Sequence[RgbdFrame]) -> None:
     Raises:
         CameraError: there is none, or they are not of one camera.
     """
-    if not frames or any(frame.intrinsics != frames[0].intrinsics for frame in frames):
-        raise CameraError("save_frames() takes at least one frame, all of the same intrinsics.")
+    if not frames or any(_device(frame) != _device(frames[0]) for frame in frames):
+        raise CameraError("save_frames() takes at least one frame, all of one camera and the same intrinsics.")
     arrays = {
         "colour": np.stack([frame.colour for frame in frames]),
         "depth_m": np.stack([frame.depth_m for frame in frames]),
         "stamp_s": np.array([frame.stamp_s for frame in frames]),
         "sequence": np.array([frame.sequence for frame in frames]),
+        "serial": np.array(frames[0].serial),
     }
     masks = [frame.truth_mask for frame in frames]
     if all(mask is not None for mask in masks):
@@ -112,6 +113,10 @@ def save_frames(path: str | Path, frames: Sequence[RgbdFrame]) -> None:
     arrays |= {f"intrinsics_{name}": np.array(value) for name, value in asdict(frames[0].intrinsics).items()}
     with Path(path).open("wb") as file:
         np.savez_compressed(file, allow_pickle=False, **arrays)
+
+
+def _device(frame: RgbdFrame) -> tuple[Intrinsics, str]:
+    return frame.intrinsics, frame.serial
 
 
 def load_frames(path: str | Path) -> list[RgbdFrame]:
@@ -130,6 +135,7 @@ def load_frames(path: str | Path) -> list[RgbdFrame]:
             **{name: float(arrays[f"intrinsics_{name}"]) for name in ("fx", "fy", "cx", "cy")},
         )
         masks = arrays.get("truth_mask")
+        serial = str(arrays.get("serial", ""))  # recordings of before it was known
         return [
             RgbdFrame(
                 colour=colour,
@@ -137,6 +143,7 @@ def load_frames(path: str | Path) -> list[RgbdFrame]:
                 intrinsics=intrinsics,
                 stamp_s=float(arrays["stamp_s"][i]),
                 sequence=int(arrays["sequence"][i]),
+                serial=serial,
                 truth_mask=None if masks is None else masks[i],
             )
             for i, colour in enumerate(arrays["colour"])
