@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from pathlib import Path
 from typing import TypeVar
 
@@ -11,13 +10,9 @@ import torch
 from torch import nn
 
 from models.graspgen.network import Denoiser, Discriminator
+from models.weights_file import WEIGHTS_FOLDER, WeightsError, read_arrays, write_arrays
 
 Network = TypeVar("Network", bound=nn.Module)
-WEIGHTS_FOLDER = Path(__file__).resolve().parent.parent / "weights"
-
-
-class WeightsError(ValueError):
-    """A weights file that is missing, damaged or of another network."""
 
 
 def weights_path(gripper: str = "agnostic") -> Path:
@@ -29,10 +24,7 @@ def save_weights(path: Path, generator: Denoiser, discriminator: Discriminator) 
     """Write both networks to `path` and their SHA-256 beside it; return the latter."""
     arrays = {f"generator/{k}": v for k, v in generator.state_dict().items()}
     arrays |= {f"discriminator/{k}": v for k, v in discriminator.state_dict().items()}
-    np.savez(path, **{k: v.numpy().astype(np.float16) for k, v in arrays.items()})
-    digest = hashlib.sha256(path.read_bytes()).hexdigest()
-    path.with_suffix(".sha256").write_text(f"{digest}  {path.name}\n")
-    return digest
+    return write_arrays(path, {k: v.numpy().astype(np.float16) for k, v in arrays.items()})
 
 
 def load_weights(path: Path) -> tuple[Denoiser, Discriminator]:
@@ -41,18 +33,8 @@ def load_weights(path: Path) -> tuple[Denoiser, Discriminator]:
     Raises:
         WeightsError: the file or its checksum is missing, they do not agree, or the file is of another network.
     """
-    checksum = path.with_suffix(".sha256")
-    for needed in (path, checksum):
-        if not needed.is_file():
-            raise WeightsError(f"{needed} is missing; restore it, or make it with `python -m scripts.train_graspgen`.")
-    seen, wanted = hashlib.sha256(path.read_bytes()).hexdigest(), checksum.read_text().split()[0]
-    if seen != wanted:
-        raise WeightsError(
-            f"{path.name} has SHA-256 {seen[:12]}…, {checksum.name} says {wanted[:12]}…: the file is damaged or was "
-            "exchanged; restore both from the repository."
-        )
-    with np.load(path, allow_pickle=False) as file:
-        arrays = {key: torch.from_numpy(file[key].astype(np.float32)) for key in file.files}
+    halves = read_arrays(path, "python -m scripts.train_graspgen")
+    arrays = {key: torch.from_numpy(value.astype(np.float32)) for key, value in halves.items()}
     return _filled(Denoiser(), "generator/", arrays, path), _filled(Discriminator(), "discriminator/", arrays, path)
 
 
