@@ -60,7 +60,7 @@ class DiffusionSampler:
         self.config = config or DiffusionConfig()
         path = self.config.weights or weights_path(self.config.gripper)
         self._generator, self._discriminator = load_weights(path)
-        self._workers = _single_threaded_workers(self.config.threads)
+        self._workers = single_threaded_workers(self.config.threads)
         # What the first call compiles and allocates shall not be waited for when an object stands there.
         self.sample(np.random.default_rng(0).uniform([-0.03, -0.08, 0.39], [0.05, 0.08, 0.40], (600, 3)), 800, 0)
 
@@ -105,7 +105,7 @@ class DiffusionSampler:
         return np.concatenate(T), np.concatenate(widths), np.concatenate(scores)
 
 
-def _single_threaded_workers(count: int) -> ThreadPoolExecutor:
+def single_threaded_workers(count: int) -> ThreadPoolExecutor:
     """Return workers within which torch uses one thread each.
 
     Torch's own threads wait for each other after every operation, some thousand times a call: beside a servo loop on
