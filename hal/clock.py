@@ -34,6 +34,14 @@ class WallClock:
             time.sleep(left)
 
 
+def unix_offset_s(clock: Clock) -> float:
+    """Return what to add to a time of `clock` to get Unix time [s]; 0 for any clock but the wall's.
+
+    Only for devices that stamp their data with the system's time, which may jump: ask each time.
+    """
+    return time.time() - time.monotonic() if isinstance(clock, WallClock) else 0.0
+
+
 class ManualClock:
     """A clock for tests: it moves only when told, or when somebody sleeps on it."""
 
