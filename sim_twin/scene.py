@@ -16,6 +16,7 @@ from sim_twin.z1_mjcf import BIT_BASE, BIT_HAND, BIT_SCENE, CONTACT_SOLIMP, CONT
 PHYSICS_PERIOD_S = z1.CONTROL_PERIOD_S / 2
 """Two physics steps in a control period: contacts of 4 ms time constant need steps of 2 ms or less [s]."""
 FIXTURE = "fixture"
+TABLE_RGBA = (0.74, 0.66, 0.55, 1)
 
 # Nearer, the open jaws touch the object at home; farther, or more to the side, the wrist cannot face it.
 _DISTANCE_M = (0.30, 0.65)
@@ -159,7 +160,7 @@ def _add_surroundings(spec: mujoco.MjSpec) -> None:
     floor = spec.add_material(name="floor", texrepeat=[8, 8], texuniform=False, specular=0.1, shininess=0.1)
     floor.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "floor"
     for name, rgba, specular in (
-        ("table", (0.74, 0.66, 0.55, 1), 0.15),
+        ("table", TABLE_RGBA, 0.15),
         ("link", (0.86, 0.88, 0.91, 1), 0.5),
         ("dark", (0.20, 0.22, 0.26, 1), 0.5),
         ("jaw", (0.15, 0.16, 0.19, 1), 0.4),
