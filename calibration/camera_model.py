@@ -7,10 +7,16 @@ from typing import Any
 
 import numpy as np
 
+from calibration.errors import CalibrationError
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class CameraModel:
-    """What turns a point in front of the camera into a pixel; the centre of pixel (0, 0) is at 0.0."""
+    """What turns a point in front of the camera into a pixel; the centre of pixel (0, 0) is at 0.0.
+
+    Raises:
+        CalibrationError: `bad_camera`: wrong shapes, values that are not finite, no focal length.
+    """
 
     matrix: np.ndarray
     """(3, 3) camera matrix [px]."""
@@ -19,24 +25,69 @@ class CameraModel:
     size: tuple[int, int]
     """Width and height of the image [px]."""
 
+    def __post_init__(self) -> None:
+        for name, shape in (("matrix", (3, 3)), ("distortion", (5,))):
+            array = np.array(getattr(self, name), dtype=np.float64)
+            if array.shape != shape or not np.isfinite(array).all():
+                raise CalibrationError("bad_camera", f"a camera's {name} is {shape} and finite; got\n{array}")
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+        width, height = self.size
+        if min(width, height, self.matrix[0, 0], self.matrix[1, 1]) <= 0:
+            raise CalibrationError("bad_camera", f"no camera has the matrix\n{self.matrix}\nand the size {self.size}.")
+        object.__setattr__(self, "size", (int(width), int(height)))
+
     @classmethod
     def pinhole(cls, *, fx: float, fy: float, cx: float, cy: float, width: int, height: int) -> CameraModel:
         """Return a camera without distortion from the fields of the HAL's `Intrinsics`."""
-        raise NotImplementedError
+        matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+        return cls(matrix=matrix, distortion=np.zeros(5), size=(width, height))
 
     def project(self, points_m: np.ndarray) -> np.ndarray:
         """Return the pixels (..., 2) of points (..., 3) in the camera frame [m], z > 0."""
-        raise NotImplementedError
+        return self.project_with_slope(points_m)[0]
+
+    def project_with_slope(self, points_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the pixels (..., 2) of points (..., 3), and their derivatives (..., 2, 3) [px/m]."""
+        k1, k2, p1, p2, k3 = self.distortion
+        inverse_z = 1.0 / points_m[..., 2]
+        x, y = points_m[..., 0] * inverse_z, points_m[..., 1] * inverse_z
+        r2 = x * x + y * y
+        radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        slope = 2.0 * (k1 + r2 * (2.0 * k2 + 3.0 * r2 * k3))  # of radial, by x over x
+        bent = np.stack(
+            [
+                x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
+                y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
+            ],
+            axis=-1,
+        )
+        cross = x * y * slope + 2.0 * (p1 * x + p2 * y)
+        d_bent = np.empty((*x.shape, 2, 2))
+        d_bent[..., 0, 0] = radial + x * x * slope + 2.0 * p1 * y + 6.0 * p2 * x
+        d_bent[..., 0, 1] = d_bent[..., 1, 0] = cross
+        d_bent[..., 1, 1] = radial + y * y * slope + 6.0 * p1 * y + 2.0 * p2 * x
+        d_ray = np.zeros((*x.shape, 2, 3))
+        d_ray[..., 0, 0] = d_ray[..., 1, 1] = inverse_z
+        d_ray[..., 0, 2], d_ray[..., 1, 2] = -x * inverse_z, -y * inverse_z
+        focal = self.matrix[:2, :2]
+        return bent @ focal.T + self.matrix[:2, 2], focal @ d_bent @ d_ray
 
     def to_dict(self) -> dict[str, Any]:
         """Return the fields for a JSON file."""
-        raise NotImplementedError
+        return {"matrix": self.matrix.tolist(), "distortion": self.distortion.tolist(), "size": list(self.size)}
 
     @classmethod
-    def from_dict(cls, fields: dict[str, Any]) -> CameraModel:
+    def from_dict(cls, values: dict[str, Any]) -> CameraModel:
         """Return the camera of `to_dict()`.
 
         Raises:
             CalibrationError: missing fields, wrong shapes, or values that are not finite.
         """
-        raise NotImplementedError
+        try:
+            width, height = values["size"]
+            return cls(matrix=values["matrix"], distortion=values["distortion"], size=(width, height))
+        except (KeyError, TypeError, ValueError) as error:
+            if isinstance(error, CalibrationError):
+                raise
+            raise CalibrationError("bad_camera", f"{values} is no camera: {error!r}.") from error
