@@ -96,7 +96,7 @@ class RankedGrasps:
     scores: np.ndarray
     """(M,) what they were ranked by, never rising."""
     alignments: np.ndarray
-    """(M,) the paper's a_j in (0, 1]; NaN when no box was used."""
+    """(M,) the paper's a_j, in (0, 1] unless the hard filter was left out; NaN when no box was used."""
     box: OrientedBox | None
     """The box that chose; None for the baseline by score alone."""
     faces: np.ndarray
@@ -106,7 +106,9 @@ class RankedGrasps:
         return len(self.indices)
 
 
-def rank_grasps(grasps: GraspSet, box: OrientedBox, *, k: int = 2, alpha: float = 0.85) -> RankedGrasps:
+def rank_grasps(
+    grasps: GraspSet, box: OrientedBox, *, k: int = 2, alpha: float = 0.85, hard_filter: bool = True
+) -> RankedGrasps:
     """Keep the grasps that come at one of the `k` nearest faces, and rank them by alignment and score.
 
     The paper's a_j = max over those faces of −z_jᵀn, the hard filter a_j > 0, and α·a_j + (1 − α)·s̄_j, where
@@ -118,13 +120,14 @@ def rank_grasps(grasps: GraspSet, box: OrientedBox, *, k: int = 2, alpha: float 
         box: the object's box.
         k: how many faces may be approached, 1 to 6.
         alpha: weight of the alignment against the generator's score, in [0, 1].
+        hard_filter: False keeps the refused ones too, for ablations; they rank low by their alignment.
     """
     if not 0.0 <= alpha <= 1.0:
         raise ValueError(f"alpha is {alpha}; it weighs alignment against score and lies in [0, 1].")
     faces = nearest_faces(box, k)
     approaches = grasps.T_camera_grasps[:, :3, 2]
     alignments = np.max(-approaches @ box.face_normals[faces].T, axis=1)
-    kept = np.flatnonzero(alignments > 0.0)
+    kept = np.flatnonzero(alignments > 0.0) if hard_filter else np.arange(len(grasps))
     combined = alpha * alignments[kept] + (1.0 - alpha) * _normalised(grasps.scores[kept])
     order = np.argsort(-combined, kind="stable")
     indices = kept[order]

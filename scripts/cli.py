@@ -13,6 +13,7 @@ from types import TracebackType
 COMMANDS = {
     "demo": ("scripts.run_demo", "the twin sees an object and lifts it, end to end"),
     "run": ("scripts.run_runtime", "see, plan and move, against a HAL that runs already"),
+    "bench": ("scripts.run_benchmark", "the paper's 81 scenarios: success by method, with intervals"),
     "hal": ("scripts.run_hal", "serve the arm and the camera, with the servo loop and its limits"),
     "stop": ("scripts.stop_arm", "stop the arm now; it stays stopped until re-armed"),
     "rearm": ("scripts.rearm_arm", "lift the stop, after somebody has looked at the arm"),

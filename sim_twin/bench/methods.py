@@ -1,0 +1,114 @@
+"""The orders in which a method tries the very same candidates."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from models.mvbb import FitMethod, RankedGrasps, fit_obb, rank_by_score, rank_grasps
+from models.types import GraspSet
+from z1_runtime.candidates import Candidates
+from z1_runtime.collision import CollisionChecker
+from z1_runtime.decision import Decider
+from z1_runtime.types import Observation
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Method:
+    """How candidates are filtered and ranked."""
+
+    name: str
+    """As the reports call it."""
+    rank_by: Literal["score", "box", "full"]
+    """The generator's score; the paper's MVBB; or all that the runtime knows."""
+    collision_filter: bool = True
+    """Whether grasps that hit the point cloud are dropped before the ranking."""
+    box: FitMethod = "pca"
+    """How the box is fitted."""
+    k: int = 2
+    """Faces that may be approached."""
+    alpha: float = 0.85
+    """Weight of the alignment."""
+    hard_filter: bool = True
+    """Whether grasps with a_j ≤ 0 are dropped; without it they only rank low."""
+
+    def order(
+        self, candidates: GraspSet, observation: Observation, decider: Decider, q: np.ndarray
+    ) -> tuple[RankedGrasps, int]:
+        """Return the candidates in the order to try them, and how many were free of collision.
+
+        Args:
+            candidates: of the generator, camera frame.
+            observation: what they were made from.
+            decider: whose kinematics, gripper and box settings are used.
+            q: (7,) joints when the frame was taken [rad].
+
+        Raises:
+            DegenerateCloudError: the object's cloud spans no box.
+            NoPlanError: `full` keeps none.
+        """
+        if self.rank_by == "full":
+            return decider.rank(candidates, observation), len(candidates)
+        free = candidates[_free(candidates, observation, decider, q)] if self.collision_filter else candidates
+        if self.rank_by == "score":
+            return rank_by_score(free), len(free)
+        box = fit_obb(observation.object_points, self.box, up=observation.T_base_camera[2, :3])
+        return rank_grasps(free, box, k=self.k, alpha=self.alpha, hard_filter=self.hard_filter), len(free)
+
+
+METHODS = {
+    "vanilla": Method(name="vanilla", rank_by="score"),
+    "mvb": Method(name="mvb", rank_by="box"),
+    "full": Method(name="full", rank_by="full"),
+}
+"""`vanilla` and `mvb` are the paper's; `full` is the runtime's own."""
+_SETTINGS = {"k": int, "alpha": float, "box": str, "hard_filter": "bool", "collision_filter": "bool"}
+
+
+def parse_method(text: str) -> Method:
+    """Return the method that `text` names: `mvb`, or with settings `mvb:k=3,alpha=0.5,box=upright,hard_filter=no`.
+
+    Raises:
+        ValueError: no such method or setting.
+    """
+    name, _, settings = text.partition(":")
+    if name not in METHODS:
+        raise ValueError(f"there is no method {name!r}; known: {', '.join(METHODS)}.")
+    changes: dict[str, object] = {}
+    for setting in filter(None, settings.split(",")):
+        key, _, value = setting.partition("=")
+        if key not in _SETTINGS:
+            raise ValueError(f"method {text!r} has an unknown setting {key!r}; known: {', '.join(_SETTINGS)}.")
+        changes[key] = _converted(text, key, value)
+    return replace(METHODS[name], name=text, **changes)  # pyright: ignore[reportArgumentType]
+
+
+def _converted(text: str, key: str, value: str) -> object:
+    kind = _SETTINGS[key]
+    if kind == "bool":
+        if value not in ("yes", "no"):
+            raise ValueError(f"method {text!r}: {key} is {value!r}; say yes or no.")
+        return value == "yes"
+    try:
+        converted = kind(value)  # pyright: ignore[reportCallIssue]
+    except ValueError as error:
+        raise ValueError(f"method {text!r}: {key} is {value!r}, which is no number.") from error
+    if key == "box" and value not in ("pca", "min_volume", "upright"):
+        raise ValueError(f"method {text!r}: box is {value!r}; allowed: pca, min_volume, upright.")
+    return converted
+
+
+def _free(candidates: GraspSet, observation: Observation, decider: Decider, q: np.ndarray) -> np.ndarray:
+    """Return (N,) which candidates the beak can be laid around without hitting a point that was seen."""
+    planner = decider.planner
+    checker = CollisionChecker(decider.kinematics, observation, q, planner.config.collision)
+    laid = Candidates(
+        candidates,
+        observation.T_base_camera,
+        planner.gripper,
+        checker,
+        fallback_width_m=planner.config.fallback_width_m,
+    )
+    return laid.free()

@@ -1,0 +1,57 @@
+"""The two statistics a comparison of success rates needs."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.stats import binom
+
+
+class Interval(NamedTuple):
+    """A range of rates."""
+
+    low: float
+    high: float
+
+
+def wilson(successes: int, trials: int, z: float = 1.96) -> Interval:
+    """Return the Wilson score interval of a rate (Wilson 1927), by default of 95 %.
+
+    Raises:
+        ValueError: the counts contradict each other.
+    """
+    if not 0 <= successes <= trials:
+        raise ValueError(f"{successes} successes in {trials} trials cannot be.")
+    if trials == 0:
+        return Interval(0.0, 1.0)
+    rate = successes / trials
+    centre = rate + z * z / (2.0 * trials)
+    half = z * np.sqrt(rate * (1.0 - rate) / trials + z * z / (4.0 * trials * trials))
+    scale = 1.0 + z * z / trials
+    return Interval(float(max((centre - half) / scale, 0.0)), float(min((centre + half) / scale, 1.0)))
+
+
+class McNemar(NamedTuple):
+    """A paired comparison of two methods on the same scenarios."""
+
+    only_first: int
+    """Scenarios that only the first solved."""
+    only_second: int
+    """Scenarios that only the second solved."""
+    p: float
+    """Two-sided exact p (the binomial form of McNemar 1947)."""
+
+
+def mcnemar(first: np.ndarray, second: np.ndarray) -> McNemar:
+    """Compare successes (N,) bool of two methods, scenario by scenario.
+
+    Raises:
+        ValueError: the lengths differ.
+    """
+    first, second = np.asarray(first, dtype=bool), np.asarray(second, dtype=bool)
+    if first.shape != second.shape:
+        raise ValueError(f"{first.shape} and {second.shape}: paired methods need the very same scenarios.")
+    b, c = int((first & ~second).sum()), int((~first & second).sum())
+    p = min(1.0, 2.0 * float(binom.cdf(min(b, c), b + c, 0.5))) if b + c else 1.0
+    return McNemar(b, c, p)
