@@ -29,7 +29,8 @@ KD_SCALE = 0.0128
 """Damping at the motor per unit of `kd` on the wire [Nm s/rad] (wire)."""
 
 # A field beyond these is not a Z1's: several times what it can do, so that a real but strange arm is never refused.
-_PLAUSIBLE = {"tau": 1e3, "dq": 1e3, "ddq": 1e6, "q": 1e2}
+_FIELDS = ("tau", "dq", "ddq", "q")
+_PLAUSIBLE = np.array([300.0, 100.0, 1e5, 50.0])
 
 
 class WireError(HalError, ValueError):
@@ -140,24 +141,16 @@ def unpack_states(records: np.ndarray) -> JointStates:
     Raises:
         WireError: a value that is not finite, or that no Z1 can have.
     """
-    values = {}
-    for name, limit in _PLAUSIBLE.items():
-        column = records[name]
-        # The comparison is false for a NaN, too; casting one would warn.
-        if not (np.abs(column) <= limit).all():
-            raise _not_plausible(column, name, limit)
-        values[name] = column.astype(np.float64)
-    if records.dtype == JOINT_STATE:
-        motors = records["motors"]
-        motor_values = {"temperature_c": motors["temperature"], "error": motors["error"], "link": motors["link"] >> 6}
-    else:
-        shape = (len(records), 2)
-        motor_values = {
-            "temperature_c": np.zeros(shape, dtype=np.int8),
-            "error": np.zeros(shape, dtype=np.uint8),
-            "link": np.zeros(shape, dtype=np.uint8),
-        }
-    return JointStates(**values, **motor_values)
+    # Through the bytes: a structured array costs several times as much to look through, 500 times a second.
+    raw = records.view(np.uint8).reshape(len(records), -1)
+    floats = np.ascontiguousarray(raw[:, : JOINT_STATE_OLD.itemsize]).view("<f4")
+    if not (np.abs(floats) <= _PLAUSIBLE).all():  # false for a NaN, too
+        raise _not_plausible(floats)
+    tau, dq, ddq, q = floats.astype(np.float64).T
+    motors = raw[:, JOINT_STATE_OLD.itemsize :] if records.dtype == JOINT_STATE else np.zeros((len(raw), 6), np.uint8)
+    motors = motors.reshape(-1, 2, MOTOR.itemsize)
+    temperature_c, error, link = motors[..., 0].view(np.int8), motors[..., 1], motors[..., 2] >> 6
+    return JointStates(q=q, dq=dq, ddq=ddq, tau=tau, temperature_c=temperature_c, error=error, link=link)
 
 
 def _pack(values: JointCommands | JointStates, dtype: np.dtype, names: tuple[str, ...]) -> np.ndarray:
@@ -177,8 +170,9 @@ def _not_finite(records: np.ndarray, names: tuple[str, ...]) -> WireError:
     return WireError(f"{name} of {z1.JOINT_NAMES[joint]} is {records[name][joint]}; it must be finite.")
 
 
-def _not_plausible(column: np.ndarray, name: str, limit: float) -> WireError:
-    joint = int(np.argmin(np.abs(column) <= limit))
+def _not_plausible(values: np.ndarray) -> WireError:
+    joint, column = divmod(int(np.argmin(np.abs(values) <= _PLAUSIBLE)), len(_FIELDS))
     return WireError(
-        f"{name} of {z1.JOINT_NAMES[joint]} is {column[joint]}; a Z1 never measures beyond ±{limit:g} (SI units)."
+        f"{_FIELDS[column]} of {z1.JOINT_NAMES[joint]} is {values[joint, column]}; a Z1 never measures beyond "
+        f"±{_PLAUSIBLE[column]:g} (SI units)."
     )
