@@ -91,3 +91,25 @@ def check_request(points: np.ndarray, n: int) -> np.ndarray:
     if not np.isfinite(points).all():
         raise ValueError("The cloud holds points that are NaN or infinite; drop invalid depth first.")
     return points
+
+
+LARGEST_OBJECT_M = 1.0
+"""Longest side of a cloud that can be one object's, in metres; one in millimetres is far above."""
+SMALLEST_OBJECT_M = 0.002
+"""Points nearer together than this show no shape."""
+
+
+def check_object_cloud(points: np.ndarray, n: int) -> np.ndarray:
+    """Return `points` as float64 (M, 3), if they can be one object's, in metres, and `n` grasps be asked for.
+
+    Raises:
+        ValueError: as `check_request`; also points all in one place, or not in metres.
+    """
+    points = check_request(points, n)
+    extent = float(np.ptp(points, axis=0).max())
+    if not SMALLEST_OBJECT_M < extent < LARGEST_OBJECT_M:
+        raise ValueError(
+            f"The cloud spans {extent:.4g} m; allowed is {SMALLEST_OBJECT_M} to {LARGEST_OBJECT_M} m. "
+            "Give one object's points, in metres (not millimetres)."
+        )
+    return points

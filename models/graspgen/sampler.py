@@ -10,9 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from models.graspgen.cloud import prepare_cloud
-from models.types import GraspSet, check_request
-
-_LARGEST_OBJECT_M = 1.0
+from models.types import GraspSet, check_object_cloud
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -70,7 +68,7 @@ class DiffusionSampler:
         Raises:
             ValueError: fewer than 30 points, points not finite, all in one place, or not in metres.
         """
-        points = _checked(points, n)
+        points = check_object_cloud(points, n)
         rng = np.random.default_rng(seed)
         cloud = prepare_cloud(points, rng)
         T_view_grasps, widths, scores = self._denoise(cloud.points, cloud.normals, n, rng)
@@ -124,14 +122,3 @@ def single_threaded_workers(count: int) -> ThreadPoolExecutor:
     list(workers.map(lambda _: barrier.wait(), range(count)))  # all have begun
     torch.set_num_threads(before)
     return workers
-
-
-def _checked(points: np.ndarray, n: int) -> np.ndarray:
-    points = check_request(points, n)
-    extent = float(np.ptp(points, axis=0).max())
-    if not 0.002 < extent < _LARGEST_OBJECT_M:
-        raise ValueError(
-            f"The cloud spans {extent:.4g} m; allowed is 0.002 to {_LARGEST_OBJECT_M} m. "
-            "Give one object's points, in metres (not millimetres)."
-        )
-    return points
