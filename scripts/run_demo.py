@@ -55,6 +55,10 @@ class Config:
     """One process on the twin's own clock: slower to watch, and the same figures for the same seed."""
     detector: str | None = None
     """Overrides the configuration: `tabletop`, or `truth` for evaluation."""
+    generator: str | None = None
+    """Overrides the configuration: which grasp generator, such as `diffusion` or `union:obb_sweep+diffusion`."""
+    generator_weights: Path | None = None
+    """Overrides the configuration: the generator's weights, such as a GraspGen checkpoint (.yml)."""
     config: Path | None = None
     """A YAML file of settings (see `./z1 show-config`)."""
     bus: Annotated[BusConfig, tyro.conf.arg(name="")] = field(default_factory=BusConfig)
@@ -120,6 +124,10 @@ def _assemble(
     runtime = replace(load_config(config.config), seed=config.seed)
     if config.detector is not None:
         runtime = replace(runtime, detector=config.detector)
+    if config.generator is not None:
+        runtime = replace(runtime, generator=config.generator)
+    if config.generator_weights is not None:
+        runtime = replace(runtime, generator_weights=str(config.generator_weights))
     save_config(runtime, config.out / "config.yaml")
     decider = make_decider(runtime)
     decider.warm_up()

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 
 from hal import z1
-from models.antipodal import AntipodalSampler
-from models.types import GraspGenerator
+from models.generators import GeneratorOptions, make_generator
 from z1_runtime.config import RuntimeConfig
 from z1_runtime.decision import Decider
 from z1_runtime.detectors import make_detector
@@ -27,23 +28,16 @@ def make_decider(config: RuntimeConfig, T_flange_camera: np.ndarray = z1.T_FLANG
     return Decider(
         kinematics=kinematics,
         perception=Perception(config.perception, make_detector(config.detector)),
-        generator=make_generator(config.generator),
+        generator=make_generator(config.generator, _generator_options(config)),
         planner=GraspPlanner(kinematics, config.planner, MotionLimits.at_speed(config.speed)),
         config=config,
         T_flange_camera=T_flange_camera,
     )
 
 
-def make_generator(name: str) -> GraspGenerator:
-    """Return the grasp generator called `name`; what it needs is imported only here.
-
-    Raises:
-        ValueError: no generator is called that, or its weights are missing or damaged.
-    """
-    if name == "antipodal":
-        return AntipodalSampler()
-    if name == "diffusion":
-        from models.graspgen.sampler import DiffusionSampler
-
-        return DiffusionSampler()
-    raise ValueError(f"unknown generator {name!r}; known: antipodal, diffusion.")
+def _generator_options(config: RuntimeConfig) -> GeneratorOptions:
+    return GeneratorOptions(
+        weights=Path(config.generator_weights) if config.generator_weights else None,
+        process=config.generator_process,
+        python=Path(config.generator_python) if config.generator_python else None,
+    )

@@ -6,10 +6,11 @@ import difflib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, TypeVar, get_args
 
 import yaml
 
+from models.generators import Process, split_generator_name
 from z1_runtime.executor import ExecutorConfig
 from z1_runtime.perception import PerceptionConfig
 from z1_runtime.planner import PlannerConfig
@@ -28,7 +29,14 @@ class RuntimeConfig:
     detector: str = "tabletop"
     """Which detector: `tabletop` (depth above the table) or `truth` (the twin's mask, for evaluation)."""
     generator: str = "antipodal"
-    """Which grasp generator: `antipodal` (no learning) or `diffusion` (the learned one)."""
+    """Which grasp generator: `antipodal`, `obb_sweep` (no learning), `diffusion` (the learned one that ships),
+    `graspgen`, `graspgenx` (NVIDIA's; weights are yours to bring), or `union:a+b` of any of them."""
+    generator_weights: str = ""
+    """Checkpoint of `graspgen` (.yml) or `graspgenx` (folder), or other weights (.npz) of `diffusion`; empty = ours."""
+    generator_process: Process = "in"
+    """Where `graspgen` and `graspgenx` run: `in` the runtime's process, or in their `own`."""
+    generator_python: str = ""
+    """The Python of that process; empty = that of `python -m scripts.make_generator_env`."""
     n_candidates: int = 800
     """Grasps the generator proposes (the paper's N)."""
     seed: int = 0
@@ -59,7 +67,8 @@ class RuntimeConfig:
     """How trajectories are handed to the servo."""
 
     def __post_init__(self) -> None:
-        _require(self.generator in ("antipodal", "diffusion"), "generator", self.generator, "antipodal or diffusion")
+        split_generator_name(self.generator)
+        _require(self.generator_process in get_args(Process), "generator_process", self.generator_process, "in or own")
         _require(1 <= self.n_candidates <= 20_000, "n_candidates", self.n_candidates, "1 to 20000")
         _require(
             self.box_method in ("upright", "pca", "min_volume"),

@@ -7,8 +7,9 @@ import pytest
 
 from hal import z1
 from models.antipodal import AntipodalSampler
+from models.generators import make_generator
 from models.graspgen.sampler import DiffusionSampler
-from z1_runtime.assembly import make_decider, make_generator
+from z1_runtime.assembly import make_decider
 from z1_runtime.config import ConfigError, RuntimeConfig, load_config
 from z1_runtime.motion_limits import MotionLimits
 from z1_runtime.planner import PlannerConfig
@@ -20,11 +21,11 @@ def test_each_name_makes_its_generator():
 
 
 def test_an_unknown_generator_is_refused_with_the_known_ones(tmp_path):
-    with pytest.raises(ValueError, match="antipodal, diffusion"):
+    with pytest.raises(ValueError, match="antipodal, obb_sweep, diffusion"):
         make_generator("oracle")
     path = tmp_path / "config.yaml"
     path.write_text("generator: oracle\n")
-    with pytest.raises(ConfigError, match="antipodal or diffusion"):
+    with pytest.raises(ConfigError, match="antipodal, obb_sweep, diffusion"):
         load_config(path)
 
 
