@@ -55,6 +55,14 @@ class Config:
     """One process on the twin's own clock: slower to watch, and the same figures for the same seed."""
     detector: str | None = None
     """Overrides the configuration: `tabletop`, or `truth` for evaluation."""
+    calibration: Path | None = None
+    """A hand-eye result; by default the newest of this camera (see `./z1 calibrate`), else the mount's drawing."""
+    mount_error_m: float = 0.0
+    """How far the twin's camera really sits from where the mount's drawing has it [m]."""
+    mount_error_deg: float = 0.0
+    """How far it is really turned [°]."""
+    mount_seed: int = 0
+    """Of the direction of both."""
     generator: str | None = None
     """Overrides the configuration: which grasp generator, such as `diffusion` or `union:obb_sweep+diffusion`."""
     generator_weights: Path | None = None
@@ -78,6 +86,9 @@ def main(config: Config) -> int:
         lateral_m=config.lateral_m,
         pitch_deg=config.pitch_deg,
         seed=config.seed,
+        mount_error_m=config.mount_error_m,
+        mount_error_deg=config.mount_error_deg,
+        mount_seed=config.mount_seed,
     )
     console.print(f"[bold]{config.object}[/] at {config.distance_m:.2f} m, {config.lateral_m:+.2f} m to the left")
     summary = _identity(config)
@@ -119,6 +130,7 @@ def _assemble(
     from z1_runtime.config import load_config, save_config
     from z1_runtime.frame_tap import FrameTap
     from z1_runtime.inspect import Inspector
+    from z1_runtime.mount import find_mount
     from z1_runtime.pipeline import PickPipeline
 
     runtime = replace(load_config(config.config), seed=config.seed)
@@ -129,14 +141,16 @@ def _assemble(
     if config.generator_weights is not None:
         runtime = replace(runtime, generator_weights=str(config.generator_weights))
     save_config(runtime, config.out / "config.yaml")
-    decider = make_decider(runtime)
+    mount = find_mount(scene.camera_serial(), config.calibration)
+    console.print(f"  {'camera':<9} {mount.origin}", soft_wrap=True)
+    decider = make_decider(runtime, mount.T_flange_camera)
     decider.warm_up()
     inspector = Inspector(config.out / "episode.rrd", live=config.view)
     undo.callback(inspector.close)
     robot = undo.enter_context(remote_robot(process, config.bus) if process else lockstep_robot(scene))
     robot.arm.claim("demo")  # given back by its disconnecting, which forgives a HAL that is gone
     if process:
-        undo.enter_context(FrameTap(robot.camera, robot.arm, inspector))
+        undo.enter_context(FrameTap(robot.camera, robot.arm, inspector, mount.T_flange_camera))
 
     def say(phase: Phase) -> None:
         console.print(f"  {phase.name:<9} {phase.duration_s:6.2f} s")

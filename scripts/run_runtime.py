@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 class Config:
     """Where the HAL is and how the pick is done."""
 
+    calibration: Path | None = None
+    """A hand-eye result; by default the newest of this camera (see `./z1 calibrate`), else the mount's drawing."""
     config: Path | None = None
     """A YAML file of settings (see `./z1 show-config`)."""
     out: Path | None = None
@@ -62,15 +64,18 @@ def _assemble(config: Config, arm: RemoteArm, camera: RemoteCamera, console: Con
     from z1_runtime.config import load_config
     from z1_runtime.frame_tap import FrameTap
     from z1_runtime.inspect import Inspector
+    from z1_runtime.mount import find_mount
     from z1_runtime.pipeline import PickPipeline
 
     runtime = load_config(config.config)
-    decider = make_decider(runtime)
+    mount = find_mount(camera.wait_for_frame(runtime.frame_timeout_s).serial, config.calibration)
+    console.print(f"  {'camera':<9} {mount.origin}", soft_wrap=True)
+    decider = make_decider(runtime, mount.T_flange_camera)
     decider.warm_up()
     inspector = Inspector(config.out / "episode.rrd" if config.out else None, live=config.view)
     undo.callback(inspector.close)
     if config.out or config.view:
-        undo.enter_context(FrameTap(camera, arm, inspector))
+        undo.enter_context(FrameTap(camera, arm, inspector, mount.T_flange_camera))
     return PickPipeline(
         decider=decider,
         arm=arm,

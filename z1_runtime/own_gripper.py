@@ -21,7 +21,7 @@ _IN_FRONT_M = 0.02  # nearer to the lens than this are only camera and bracket t
 class OwnGripper:
     """The robot's own jaws in the picture; what stands between or behind them is not theirs.
 
-    The camera's place is the nominal one; the margin covers its calibration, the jaw's angle, and depth noise.
+    The margin covers what is left of the calibration's error, the jaw's angle, and depth noise.
     """
 
     margin_m: float = 0.010
@@ -31,14 +31,16 @@ class OwnGripper:
         if not 0.0 < self.margin_m < 0.05:
             raise ValueError(f"margin_m is {self.margin_m}; allowed is above 0 and below 0.05 m.")
 
-    def blanked(self, frame: RgbdFrame, jaw: float) -> RgbdFrame:
+    def blanked(self, frame: RgbdFrame, jaw: float, T_flange_camera: np.ndarray = z1.T_FLANGE_CAMERA) -> RgbdFrame:
         """Return `frame` with the depth of the gripper, whose mover is at `jaw` [rad], set to "not measured"."""
-        own = (frame.depth_m > 0.0) & (frame.depth_m <= self.reach_m(frame.intrinsics, jaw))
+        own = (frame.depth_m > 0.0) & (frame.depth_m <= self.reach_m(frame.intrinsics, jaw, T_flange_camera))
         return replace(frame, depth_m=np.where(own, 0.0, frame.depth_m))
 
-    def reach_m(self, intrinsics: Intrinsics, jaw: float) -> np.ndarray:
+    def reach_m(
+        self, intrinsics: Intrinsics, jaw: float, T_flange_camera: np.ndarray = z1.T_FLANGE_CAMERA
+    ) -> np.ndarray:
         """Return the (H, W) depth [m] down to which a pixel may show the gripper; 0 where it is not in view."""
-        T_camera_pivot = inverse(z1.T_FLANGE_CAMERA) @ z1.T_FLANGE_PIVOT
+        T_camera_pivot = inverse(T_flange_camera) @ z1.T_FLANGE_PIVOT
         shape = gripper_shape()
         points = np.concatenate(
             [transform(T_camera_pivot, shape.fixed), transform(T_camera_pivot @ mover_pose(jaw), shape.mover)]

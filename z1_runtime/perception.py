@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
+from hal import z1
 from hal.messages import RgbdFrame
 from models.types import Detection
 from z1_runtime.cloud import (
@@ -88,11 +89,20 @@ class PerceptionConfig:
 
 
 class Perception:
-    """Detects one object and cuts the clouds; `observe` is `detect` and then `segment`."""
+    """Detects one object and cuts the clouds; `observe` is `detect` and then `segment`.
 
-    def __init__(self, config: PerceptionConfig, detector: Detector) -> None:
+    Args:
+        config: limits of the clouds.
+        detector: says where the object is.
+        T_flange_camera: (4, 4) hand-eye transform, by which the robot's own gripper is found in the picture.
+    """
+
+    def __init__(
+        self, config: PerceptionConfig, detector: Detector, T_flange_camera: np.ndarray = z1.T_FLANGE_CAMERA
+    ) -> None:
         self._config = config
         self._detector = detector
+        self._T_flange_camera = T_flange_camera
 
     def observe(self, frame: RgbdFrame, T_base_camera: np.ndarray, jaw: float, label: str | None = None) -> Observation:
         """Return what is seen; arguments and errors as in `detect` and `segment`."""
@@ -112,7 +122,7 @@ class Perception:
             NoDetectionError: nothing (of that class) was found.
         """
         _require_depth(frame)
-        found = self._detector.detect(self._config.own.blanked(frame, jaw), T_base_camera)
+        found = self._detector.detect(self._without_gripper(frame, jaw), T_base_camera)
         wanted = [d for d in found if label is None or not self._detector.classes or d.label == label]
         if not wanted:
             others = f"; it saw {', '.join(sorted({d.label for d in found}))}" if found else ""
@@ -136,7 +146,7 @@ class Perception:
             SmallCloudError: too little is left of the object; the message counts each stage.
         """
         _require_depth(frame)
-        config, depth = self._config, self._config.own.blanked(frame, jaw).depth_m
+        config, depth = self._config, self._without_gripper(frame, jaw).depth_m
         crop = detection.mask if detection.mask is not None else box_pixels(depth.shape, detection.box_px)
         rim = cv2.dilate(crop.astype(np.uint8), np.ones((2 * config.rim_px + 1,) * 2, np.uint8)).astype(bool)
         continuous = continuous_pixels(depth)
@@ -156,6 +166,9 @@ class Perception:
             scene_points=points[continuous[seen] & ~(rim[seen] & above)],
             table=table.plane,
         )
+
+    def _without_gripper(self, frame: RgbdFrame, jaw: float) -> RgbdFrame:
+        return self._config.own.blanked(frame, jaw, self._T_flange_camera)
 
     def _clean(self, points: np.ndarray, above: np.ndarray, continuous: np.ndarray) -> np.ndarray:
         """Return the object among the points of a crop, given which are above the table and which do not fly."""
