@@ -27,7 +27,7 @@ def make_decider(config: RuntimeConfig, T_flange_camera: np.ndarray = z1.T_FLANG
     kinematics = Kinematics()
     return Decider(
         kinematics=kinematics,
-        perception=Perception(config.perception, make_detector(config.detector)),
+        perception=Perception(config.perception, make_detector(config.detector), T_flange_camera),
         generator=make_generator(config.generator, _generator_options(config)),
         planner=GraspPlanner(kinematics, config.planner, MotionLimits.at_speed(config.speed)),
         config=config,
