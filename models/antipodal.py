@@ -7,10 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import KDTree
 
+from models.hands import choose_hands, count_points
 from models.surfels import Surfels, estimate_normals, find_outline, guess_hidden_sides, smooth_normals
 from models.types import GraspSet, check_request
-
-_CHUNK_HANDS = 256  # keeps a batch of hands × points inside the cache
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -93,10 +92,13 @@ class AntipodalSampler:
         surfels = self._find_surfels(points, rng)
         hands = self._draw_hands(surfels, points, int(np.ceil(n * self.config.oversampling)), rng)
         cloud = points[rng.permutation(len(points))[: self.config.n_collision_points]]
-        hits, held = self._test_hands(hands, cloud)
+        T = _poses(hands)
+        hits, held = count_points(T, hands.widths, cloud, self.config)
         scores = self._score(hands, hits, held, points)
-        chosen = _choose(scores, hits, n, rng)
-        return self._to_grasps(hands, scores, chosen)
+        chosen = choose_hands(scores, hits, n, rng)
+        return GraspSet(
+            T_camera_grasps=T[chosen], scores=scores[chosen], widths_m=hands.widths[chosen], source="antipodal"
+        )
 
     def _find_surfels(self, points: np.ndarray, rng: np.random.Generator) -> Surfels:
         """Return contacts on the visible surface and on the sides behind its outline."""
@@ -135,28 +137,6 @@ class AntipodalSampler:
             antipodality=antipodality,
         )
 
-    def _test_hands(self, hands: _Hands, cloud: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return how many points (H,) the fingers and palm of each hand hit, and how many (H,) lie between its pads."""
-        config = self.config
-        hits, held = np.zeros((2, len(hands.widths)), dtype=np.int64)
-        half_pad = config.finger_width_m / 2.0
-        for start in range(0, len(hits), _CHUNK_HANDS):
-            part = slice(start, start + _CHUNK_HANDS)
-            z_axis, y_axis = hands.approach[part], hands.closing[part]
-            x_axis = np.cross(y_axis, z_axis)
-            tips = hands.centers[part] + hands.depths[part, None] * z_axis
-            x, y, z = (
-                (axis @ cloud.T - np.sum(axis * tips, axis=1, keepdims=True)).astype(np.float32)
-                for axis in (x_axis, y_axis, z_axis)
-            )
-            inner = (hands.widths[part] / 2.0 + config.clearance_m)[:, None]
-            y = np.abs(y)
-            in_swath = (np.abs(x) < half_pad) & (z < 0.0) & (y < inner + config.finger_thickness_m)
-            above_palm = z < -config.finger_length_m
-            hits[part] = np.count_nonzero(in_swath & ((y > inner) | above_palm), axis=1)
-            held[part] = np.count_nonzero(in_swath & (y <= inner) & ~above_palm, axis=1)
-        return hits, held
-
     def _score(self, hands: _Hands, hits: np.ndarray, held: np.ndarray, points: np.ndarray) -> np.ndarray:
         """Return scores (H,) in [0, 1]: square contacts, near the centre of mass, points between the pads, no hits."""
         middle = points.mean(axis=0)
@@ -166,13 +146,13 @@ class AntipodalSampler:
         quality = 0.45 * hands.antipodality + 0.25 * np.exp(-0.5 * away**2) + 0.3 * support
         return quality / (1.0 + hits)
 
-    @staticmethod
-    def _to_grasps(hands: _Hands, scores: np.ndarray, chosen: np.ndarray) -> GraspSet:
-        y_axis, z_axis = hands.closing[chosen], hands.approach[chosen]
-        T = np.tile(np.eye(4), (len(chosen), 1, 1))
-        T[:, :3, :3] = np.stack([np.cross(y_axis, z_axis), y_axis, z_axis], axis=2)
-        T[:, :3, 3] = hands.centers[chosen] + hands.depths[chosen, None] * z_axis
-        return GraspSet(T_camera_grasps=T, scores=scores[chosen], widths_m=hands.widths[chosen], source="antipodal")
+
+def _poses(hands: _Hands) -> np.ndarray:
+    """Return the grasps (H, 4, 4)."""
+    T = np.tile(np.eye(4), (len(hands.widths), 1, 1))
+    T[:, :3, :3] = np.stack([np.cross(hands.closing, hands.approach), hands.closing, hands.approach], axis=2)
+    T[:, :3, 3] = hands.centers + hands.depths[:, None] * hands.approach
+    return T
 
 
 def _antipodal_pairs(surfels: Surfels, config: AntipodalConfig) -> tuple[np.ndarray, np.ndarray]:
@@ -220,9 +200,3 @@ def _turn_about(closing: np.ndarray, centers: np.ndarray, rng: np.random.Generat
     across = np.cross(closing, straight)
     angles = rng.uniform(-np.pi, np.pi, len(closing))[:, None]
     return np.cos(angles) * straight + np.sin(angles) * across
-
-
-def _choose(scores: np.ndarray, hits: np.ndarray, n: int, rng: np.random.Generator) -> np.ndarray:
-    """Return `n` indices, best score first: a random draw of the hands that hit nothing, then the fewest hits."""
-    order = np.argsort(hits + rng.random(len(hits)), kind="stable")[:n]
-    return order[np.argsort(-scores[order], kind="stable")]
