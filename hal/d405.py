@@ -76,7 +76,7 @@ class Calibration:
     def depth(self, width: int, height: int) -> Intrinsics:
         """Return the pinhole of depth and infrared at that resolution."""
         scale = 0.6 if _is_vga(width, height) else width / 1280
-        return _scaled(width, height, scale, (self.depth_focal_px,) * 2, self.depth_centre_px)
+        return _scaled(width, height, scale, (self.depth_focal_px, self.depth_focal_px), self.depth_centre_px)
 
     def colour(self, width: int, height: int) -> Intrinsics:
         """Return focal lengths and principal point of the colour stream, to which `colour_coeffs` belong."""

@@ -49,5 +49,9 @@ class LeaseError(CommandRefusedError):
     """Another process owns the arm, or this one has lost it."""
 
 
+class SdkMissingError(HalError, ImportError):
+    """A vendor's library that a backend needs cannot be imported here."""
+
+
 class CameraError(HalError, RuntimeError):
     """The camera delivered something that cannot be used."""

@@ -128,8 +128,8 @@ class TwinCamera:
         """
         if self._thread is not None:
             return
-        give_way = None if isinstance(self.clock, TwinClock) else _give_way
-        thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="twin-camera", initializer=give_way)
+        initializer = None if isinstance(self.clock, TwinClock) else give_way
+        thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="twin-camera", initializer=initializer)
         try:
             self._renderer = thread.submit(
                 make_renderer, self.world.model, d405.INTRINSICS, self._kind, self.world.config.board
@@ -211,7 +211,7 @@ class TwinCamera:
             raise NotConnectedError("the twin's camera")
 
 
-def _give_way() -> None:
+def give_way() -> None:
     """Lower this thread's priority: software GL and the noise must not keep the servo's thread from its core."""
     if sys.platform == "linux":  # where a priority belongs to a thread
         os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 10)

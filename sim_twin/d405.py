@@ -108,7 +108,7 @@ def _is_grazing(z: np.ndarray, v: int, u: int, pinhole: tuple[float, float, floa
 
 
 @numba.njit(nogil=True, cache=True)
-def _measure(z: np.ndarray, key: np.uint64, pinhole: tuple[float, float, float, float]) -> np.ndarray:
+def _measure(z: np.ndarray, key: np.uint64, pinhole: tuple[float, float, float, float], min_z_m: float) -> np.ndarray:
     height, width = z.shape
     focal_baseline = pinhole[0] * BASELINE_M
     noise = _smooth_noise(height, width, key, _CORRELATION_PX)
@@ -117,7 +117,7 @@ def _measure(z: np.ndarray, key: np.uint64, pinhole: tuple[float, float, float, 
     for v in range(1, height - 1):
         for u in range(1, width - 1):
             zc = z[v, u]
-            if not seen[v, u] or zc < MIN_Z_M or zc > MAX_Z_M or noise[v, u] > _BLOB_SIGMA:
+            if not seen[v, u] or zc < min_z_m or zc > MAX_Z_M or noise[v, u] > _BLOB_SIGMA:
                 continue
             low, high = zc, zc
             for near in (z[v, u - 1], z[v, u + 1], z[v - 1, u], z[v + 1, u]):
@@ -131,17 +131,17 @@ def _measure(z: np.ndarray, key: np.uint64, pinhole: tuple[float, float, float, 
             if disparity <= 0.0:
                 continue
             units = np.round(focal_baseline / disparity / DEPTH_UNIT_M)
-            if MIN_Z_M / DEPTH_UNIT_M <= units <= 65535.0:
+            if min_z_m / DEPTH_UNIT_M <= units <= 65535.0:
                 out[v, u] = units * DEPTH_UNIT_M
     return out
 
 
 @numba.njit(nogil=True, cache=True)
-def _round_exact(z: np.ndarray) -> np.ndarray:
+def _round_exact(z: np.ndarray, min_z_m: float) -> np.ndarray:
     out = np.zeros(z.shape, np.float32)
     for v in range(z.shape[0]):
         for u in range(z.shape[1]):
-            if MIN_Z_M <= z[v, u] <= MAX_Z_M:
+            if min_z_m <= z[v, u] <= MAX_Z_M:
                 out[v, u] = np.round(z[v, u] / DEPTH_UNIT_M) * DEPTH_UNIT_M
     return out
 
@@ -164,26 +164,30 @@ def _key(seed: int, sequence: int) -> np.uint64:
     return np.uint64(int(np.random.SeedSequence([seed, sequence]).generate_state(1, np.uint64)[0]))
 
 
-def measure_depth(z: np.ndarray, seed: int, sequence: int) -> np.ndarray:
+def measure_depth(
+    z: np.ndarray, seed: int, sequence: int, pinhole: Intrinsics = INTRINSICS, min_z_m: float = MIN_Z_M
+) -> np.ndarray:
     """Return what the stereo would measure (H, W) float32 [m], 0 where it finds no match.
 
     Args:
         z: exact distance along the optical axis (H, W) float32 [m]; 0 where nothing is hit.
         seed: of the scene; with `sequence` it fixes the noise.
         sequence: number of the frame.
+        pinhole: of the image.
+        min_z_m: nearest distance with a match [m].
 
     The disparity f·B/z gets noise of 0.08 px, correlated over 7 pixels, is quantised to 1/32 px and turned back into a
     depth in units of 0.1 mm, so that sigma_z = z²·sd/(f·B): 0.5 mm at 0.2 m, 2.9 mm at 0.5 m. No match is found nearer
     than min-Z, in the band at the left that only the left imager sees, in the shadow left of near things, at part of
     the edges, on surfaces seen at a grazing angle, and in small patches at random.
     """
-    i = INTRINSICS
-    return _measure(z, _key(seed, sequence), (i.fx, i.fy, i.cx, i.cy))
+    i = pinhole
+    return _measure(z, _key(seed, sequence), (i.fx, i.fy, i.cx, i.cy), min_z_m)
 
 
-def round_depth(z: np.ndarray) -> np.ndarray:
+def round_depth(z: np.ndarray, min_z_m: float = MIN_Z_M) -> np.ndarray:
     """Return exact depth (H, W) float32 [m] in units of 0.1 mm, 0 outside the range that can be expressed."""
-    return _round_exact(z)
+    return _round_exact(z, min_z_m)
 
 
 def measure_colour(colour: np.ndarray, seed: int, sequence: int) -> np.ndarray:

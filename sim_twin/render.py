@@ -47,7 +47,12 @@ class WristRenderer(Protocol):
 
 
 def make_renderer(
-    model: mujoco.MjModel, intrinsics: Intrinsics, kind: str | None = None, board: BoardSpec | None = None
+    model: mujoco.MjModel,
+    intrinsics: Intrinsics,
+    kind: str | None = None,
+    board: BoardSpec | None = None,
+    *,
+    mask: bool = True,
 ) -> WristRenderer:
     """Return a renderer for the calling thread.
 
@@ -56,6 +61,7 @@ def make_renderer(
         intrinsics: of the wrist camera.
         kind: one of `sim_twin.gl.RENDERERS`; by default what the environment variable says.
         board: that lies on the scene's table; rays know no textures.
+        mask: False leaves the object's mask empty, which saves OpenGL a pass.
 
     Raises:
         ValueError: no such kind.
@@ -63,7 +69,9 @@ def make_renderer(
     """
     from sim_twin.rays import RayRenderer
 
-    return choose(kind, lambda: EglRenderer(model, intrinsics), lambda: RayRenderer(model, intrinsics, board))
+    return choose(
+        kind, lambda: EglRenderer(model, intrinsics, mask=mask), lambda: RayRenderer(model, intrinsics, board)
+    )
 
 
 def camera_id(model: mujoco.MjModel) -> int:
@@ -89,10 +97,13 @@ def set_pinhole(scene: mujoco.MjvScene, intrinsics: Intrinsics) -> None:
 
 
 class EglRenderer:
-    """Two passes on one framebuffer of the camera's size: geom numbers with depth, then colour."""
+    """Two passes on one framebuffer of the camera's size: geom numbers with depth, then colour.
 
-    def __init__(self, model: mujoco.MjModel, intrinsics: Intrinsics) -> None:
-        self._model, self._intrinsics = model, intrinsics
+    Without the mask one pass gives both depth and colour.
+    """
+
+    def __init__(self, model: mujoco.MjModel, intrinsics: Intrinsics, *, mask: bool = True) -> None:
+        self._model, self._intrinsics, self._with_mask = model, intrinsics, mask
         width, height = intrinsics.width, intrinsics.height
         # Software GL would take every core for itself; one leaves the others to the servo. Read when GL is loaded.
         os.environ.setdefault("LP_NUM_THREADS", "1")
@@ -108,7 +119,7 @@ class EglRenderer:
         self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED.value
         self._camera.fixedcamid = camera_id(model)
         self._is_object = object_geoms(model)
-        self._ids = np.empty((height, width, 3), np.uint8)
+        self._ids = np.zeros((height, width, 3), np.uint8)
         self._inverse_z = np.empty((height, width), np.float32)
 
     def render(self, data: mujoco.MjData) -> View:
@@ -116,9 +127,13 @@ class EglRenderer:
         category = mujoco.mjtCatBit.mjCAT_ALL.value
         mujoco.mjv_updateScene(self._model, data, self._option, None, self._camera, category, self._scene)
         set_pinhole(self._scene, self._intrinsics)
-        z_m, mask = self._draw_depth_and_mask()
         colour = np.empty_like(self._ids)
-        self._canvas.draw(self._scene, colour)
+        if self._with_mask:
+            z_m, mask = self._draw_depth_and_mask()
+            self._canvas.draw(self._scene, colour)
+        else:
+            self._canvas.draw(self._scene, colour, self._inverse_z)
+            z_m, mask = _decode(self._ids, self._inverse_z, np.zeros(1, np.bool_))
         return View(colour=np.ascontiguousarray(colour[::-1]), z_m=z_m, mask=mask)
 
     def close(self) -> None:
