@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import threading
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from models.graspgen.cloud import prepare_cloud
+from models.torch_threads import single_threaded_workers
 from models.types import GraspSet, check_object_cloud
 
 
@@ -58,7 +57,7 @@ class DiffusionSampler:
         self.config = config or DiffusionConfig()
         path = self.config.weights or weights_path(self.config.gripper)
         self._generator, self._discriminator = load_weights(path)
-        self._workers = single_threaded_workers(self.config.threads)
+        self._workers = single_threaded_workers(self.config.threads, "graspgen")
         # What the first call compiles and allocates shall not be waited for when an object stands there.
         self.sample(np.random.default_rng(0).uniform([-0.03, -0.08, 0.39], [0.05, 0.08, 0.40], (600, 3)), 800, 0)
 
@@ -101,24 +100,3 @@ class DiffusionSampler:
         parts = np.array_split(noise, min(self.config.threads, n), axis=1)
         T, widths, scores = zip(*self._workers.map(denoise, parts), strict=True)
         return np.concatenate(T), np.concatenate(widths), np.concatenate(scores)
-
-
-def single_threaded_workers(count: int) -> ThreadPoolExecutor:
-    """Return workers within which torch uses one thread each.
-
-    Torch's own threads wait for each other after every operation, some thousand times a call: beside a servo loop on
-    two cores that took 12 s where 0.2 s were due. These wait once, at the end.
-    """
-    import torch
-
-    before = torch.get_num_threads()
-
-    def begin() -> None:
-        torch.set_num_threads(1)
-        torch.get_num_threads()  # settles this thread's number, so that the restoring below does not reach it
-
-    barrier = threading.Barrier(count)
-    workers = ThreadPoolExecutor(count, thread_name_prefix="graspgen", initializer=begin)
-    list(workers.map(lambda _: barrier.wait(), range(count)))  # all have begun
-    torch.set_num_threads(before)
-    return workers

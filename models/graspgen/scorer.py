@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from models.graspgen.cloud import prepare_cloud
-from models.graspgen.sampler import DiffusionConfig, single_threaded_workers
+from models.graspgen.sampler import DiffusionConfig
+from models.torch_threads import single_threaded_workers
 from models.types import GraspSet, check_object_cloud
 
 _PAD_HALF_WIDTH_M = 0.011  # of the hand that the weights were trained for
@@ -31,7 +32,7 @@ class GraspScorer:
 
         self.config = config or DiffusionConfig()
         _, self._discriminator = load_weights(self.config.weights or weights_path(self.config.gripper))
-        self._workers = single_threaded_workers(self.config.threads)
+        self._workers = single_threaded_workers(self.config.threads, "grasp-scorer")
 
     def score(self, points: np.ndarray, grasps: GraspSet, seed: int = 0) -> np.ndarray:
         """Return scores (N,) in [0, 1] of `grasps` on the object's `points` (M, 3) [m], in one frame with them.
