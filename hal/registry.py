@@ -56,6 +56,7 @@ ARMS: Registry[Arm] = Registry(
 CAMERAS: Registry[Camera] = Registry(
     "camera",
     {
+        "d405": "hal.backends.d405_camera:D405Camera",
         "replay": "hal.backends.replay_camera:ReplayCamera",
         "sim": "sim_twin.backends:TwinCamera",
     },

@@ -12,6 +12,7 @@ from hal.realsense.api import context as context
 from hal.realsense.api import frame_queue as frame_queue
 from hal.realsense.api import pipeline as pipeline
 from hal.realsense.api import pipeline_wrapper as pipeline_wrapper
+from hal.realsense.device import SERIAL as SERIAL
 from hal.realsense.device import TwinDevice as TwinDevice
 from hal.realsense.library import __full_version__ as __full_version__
 from hal.realsense.library import __version__ as __version__

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from hal.arm import Arm
+from hal.backends.d405_session import D405CameraConfig
 from hal.bus.client import RemoteArm, RemoteCamera
 from hal.bus.server import HalServer
 from hal.bus.session import BusConfig
@@ -25,6 +26,9 @@ from hal.registry import ARMS, CAMERAS
 from hal.rig import RIGS
 from hal.servo import Servo
 from hal.servo_thread import ServoThread
+from sim_twin.realsense_source import TwinSource
+from sim_twin.scene import SceneConfig
+from sim_twin.world import World
 
 
 @dataclass(frozen=True)
@@ -149,13 +153,24 @@ def remote_camera() -> Iterator[CameraCase]:
         camera.disconnect()
 
 
+@contextmanager
+def d405_over_the_twin() -> Iterator[CameraCase]:
+    """The real camera's driver, with librealsense and the twin's optics below it."""
+    source = TwinSource(World(SceneConfig()))
+    camera = CAMERAS.make("d405", config=D405CameraConfig(warm_up_s=0.1), source=source)
+    yield CameraCase(camera, source.clock)
+    camera.disconnect()
+    source.close()
+
+
 ARM_CASES: list[tuple[str, Callable[[], AbstractContextManager[ArmCase]]]] = [
     *((name, partial(registered_arm, name)) for name in ARMS.names()),
     *((f"servo over {name}", partial(servoed_arm, name)) for name in ARMS.names()),
     ("remote", remote_arm),
 ]
 CAMERA_CASES: list[tuple[str, Callable[[], AbstractContextManager[CameraCase]]]] = [
-    *((name, partial(registered_camera, name)) for name in CAMERAS.names()),
+    *((name, partial(registered_camera, name)) for name in CAMERAS.names() if name != "d405"),
+    ("d405 over the twin", d405_over_the_twin),
     ("remote", remote_camera),
 ]
 
