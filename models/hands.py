@@ -46,11 +46,10 @@ def count_points(T: np.ndarray, widths_m: np.ndarray, cloud: np.ndarray, hand: H
     half_pad = hand.finger_width_m / 2.0
     for start in range(0, len(T), _CHUNK_HANDS):
         part = slice(start, start + _CHUNK_HANDS)
+        poses = T[part]
         x, y, z = (
-            (T[part, :3, axis] @ cloud.T - np.sum(T[part, :3, axis] * T[part, :3, 3], axis=1, keepdims=True)).astype(
-                np.float32
-            )
-            for axis in range(3)
+            (axis @ cloud.T - np.sum(axis * poses[:, :3, 3], axis=1, keepdims=True)).astype(np.float32)
+            for axis in np.ascontiguousarray(poses[:, :3, :3].transpose(2, 0, 1))  # strided rows never reach BLAS
         )
         inner = (widths_m[part] / 2.0 + hand.clearance_m)[:, None]
         y = np.abs(y)
