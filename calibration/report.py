@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from calibration.detection import BoardView
-from calibration.hand_eye import HandEyeResult
+from calibration.hand_eye_result import HandEyeResult
 from calibration.intrinsics import IntrinsicsResult
 from calibration.results import Calibration
 

@@ -14,7 +14,7 @@ import numpy as np
 from calibration.board import Board
 from calibration.camera_model import CameraModel
 from calibration.errors import CalibrationWarning
-from calibration.hand_eye import HandEyeResult, Setup
+from calibration.hand_eye_result import HandEyeResult, Setup
 from calibration.intrinsics import IntrinsicsResult
 
 Kind = Literal["hand_eye", "intrinsics"]

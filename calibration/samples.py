@@ -15,7 +15,7 @@ import numpy as np
 from calibration.board import Board
 from calibration.camera_model import CameraModel
 from calibration.errors import CalibrationWarning
-from calibration.hand_eye import Setup
+from calibration.hand_eye_result import Setup
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -62,7 +62,9 @@ def _draw(board: Board, page: tuple[float, float]) -> tuple[np.ndarray, list[tup
         f"{board.columns} x {board.rows} squares of {1e3 * board.square_m:g} mm, markers {1e3 * board.marker_m:g} mm, "
         f"{board.dictionary}{', legacy' if board.legacy else ''}"
     )
-    advice = f"Print at 100 %: the ruler must measure {_RULER_MM} mm. Measure the squares. Glue the sheet on something flat."
+    advice = (
+        f"Print at 100 %: the ruler must measure {_RULER_MM} mm. Measure the squares, and glue the sheet on a plate."
+    )
     return black, [(left, ruler_y + 5.0, says), (left, ruler_y + 9.5, advice)]
 
 

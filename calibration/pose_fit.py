@@ -1,0 +1,202 @@
+"""Least squares over poses: the hand-eye, where the board is (before and after a move), and the size of its squares.
+
+A sample's error e = (position [m], rotation vector [rad]), in camera axes, is how far the board predicted through the
+arm lies from the board seen. Two things make it: the corners, whose noise reaches e through the inverse of their
+Fisher information, and the arm, whose pose scatters by `NoiseLevels` in position and orientation at the flange.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import minimize
+
+from calibration.transforms import inverse, moved, rotation_vectors, skew
+
+_SCALE_SD = 0.1  # what is known of a square's size before: nobody mistakes it by more than a tenth without noticing
+_MIN_SCATTER = 1e-6  # [m] and [rad]; an ideal arm would make the weights infinite
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PoseData:
+    """The samples as poses."""
+
+    Ts_anchor_mount: np.ndarray
+    """(N, 4, 4) the arm."""
+    Ts_camera_board: np.ndarray
+    """(N, 4, 4) the board seen."""
+    corner_covariances: np.ndarray
+    """(N, 6, 6) of the board's position and rotation in camera axes, from the noise of the corners."""
+    camera_on_flange: bool
+    """Which end of the problem the flange is: eye in hand or eye to hand."""
+
+    def __len__(self) -> int:
+        return len(self.Ts_anchor_mount)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Fit:
+    """The unknowns."""
+
+    T_mount_camera: np.ndarray
+    """(4, 4)."""
+    Ts_anchor_board: np.ndarray
+    """(G, 4, 4), one a place where the board lay."""
+    place: np.ndarray
+    """(N,) int, which of them holds for each sample."""
+    scale: float = 1.0
+    """True size of the board over that of the settings."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NoiseLevels:
+    """Standard deviations of the flange's pose along and about each axis."""
+
+    arm_m: float = 5e-4
+    arm_rad: float = 1e-3
+
+
+def predict(data: PoseData, fit: Fit) -> np.ndarray:
+    """Return where the arm says the camera sees the board, (N, 4, 4)."""
+    return inverse(data.Ts_anchor_mount @ fit.T_mount_camera) @ fit.Ts_anchor_board[fit.place]
+
+
+def errors(data: PoseData, fit: Fit) -> np.ndarray:
+    """Return e (N, 6): position [m] and rotation vector [rad] in camera axes."""
+    predicted, seen = predict(data, fit), data.Ts_camera_board
+    turned = predicted[:, :3, :3] @ np.swapaxes(seen[:, :3, :3], 1, 2)
+    return np.hstack([predicted[:, :3, 3] - fit.scale * seen[:, :3, 3], rotation_vectors(turned)])
+
+
+def slopes(data: PoseData, fit: Fit) -> np.ndarray:
+    """Return the derivatives (N, 6, 7 + 6 G) of e by the scale, the camera's ξ, and the ξ of each place."""
+    predicted = predict(data, fit)
+    n, n_places = len(data), len(fit.Ts_anchor_board)
+    J = np.zeros((n, 6, 7 + 6 * n_places))
+    J[:, :3, 0] = -data.Ts_camera_board[:, :3, 3]
+    J[:, :3, 1:4] = J[:, 3:, 4:7] = -np.eye(3)
+    J[:, :3, 4:7] = skew(predicted[:, :3, 3])
+    for i, place in enumerate(fit.place):
+        column = 7 + 6 * place
+        J[i, :3, column : column + 3] = J[i, 3:, column + 3 : column + 6] = predicted[i, :3, :3]
+    return J
+
+
+def arm_slopes(data: PoseData, fit: Fit) -> np.ndarray:
+    """Return how a small motion of the flange, in its own axes, changes e: (N, 6, 6), up to the sign."""
+    R_camera_mount = fit.T_mount_camera[:3, :3].T
+    boards = fit.Ts_anchor_board[fit.place]
+    if data.camera_on_flange:
+        R = np.broadcast_to(R_camera_mount, (len(data), 3, 3))
+        lever = (inverse(data.Ts_anchor_mount) @ boards)[:, :3, 3]
+    else:
+        R = R_camera_mount @ np.swapaxes(data.Ts_anchor_mount[:, :3, :3], 1, 2)
+        lever = boards[:, :3, 3]
+    M = np.zeros((len(data), 6, 6))
+    M[:, :3, :3] = M[:, 3:, 3:] = R
+    M[:, :3, 3:] = -R @ skew(lever)
+    return M
+
+
+def covariances(data: PoseData, fit: Fit, noise: NoiseLevels) -> np.ndarray:
+    """Return the covariance (N, 6, 6) of each sample's e."""
+    M = arm_slopes(data, fit)
+    arm = np.repeat([noise.arm_m**2, noise.arm_rad**2], 3)
+    return data.corner_covariances + (M * arm) @ np.swapaxes(M, 1, 2)
+
+
+def solve(
+    data: PoseData, fit: Fit, C: np.ndarray, weights: np.ndarray, *, free_scale: bool, rounds: int = 10
+) -> tuple[Fit, np.ndarray]:
+    """Return the fit nearest to the samples, and the covariance of (scale, camera ξ, board ξ …).
+
+    Args:
+        data: the samples.
+        fit: where to start.
+        C: (N, 6, 6) covariances of e.
+        weights: (N,) of the samples, 0 … 1.
+        free_scale: whether the squares' size is unknown; else its row and column of the covariance are 0.
+        rounds: of Gauss-Newton at most.
+    """
+    W = np.linalg.inv(C) * weights[:, None, None]
+    P = np.zeros((0, 0))
+    for _ in range(rounds):
+        e, J = errors(data, fit), slopes(data, fit)
+        step, P = _step(e, J, W, fit, free_scale)
+        n_places = len(fit.Ts_anchor_board)
+        fit = replace(
+            fit,
+            scale=fit.scale + float(step[0]),
+            T_mount_camera=moved(fit.T_mount_camera, step[1:7]),
+            Ts_anchor_board=np.stack(
+                [
+                    moved(T, step[7 + 6 * g : 13 + 6 * g])
+                    for g, T in zip(range(n_places), fit.Ts_anchor_board, strict=True)
+                ]
+            ),
+        )
+        if np.abs(step).max() < 1e-10:
+            break
+    return fit, P
+
+
+def _step(e: np.ndarray, J: np.ndarray, W: np.ndarray, fit: Fit, free_scale: bool) -> tuple[np.ndarray, np.ndarray]:
+    H = np.einsum("nki,nkl,nlj->ij", J, W, J)
+    g = np.einsum("nki,nkl,nl->i", J, W, e)
+    H[0, 0] += _SCALE_SD**-2
+    g[0] += (fit.scale - 1.0) * _SCALE_SD**-2
+    used = np.arange(0 if free_scale else 1, len(g))
+    P = np.zeros_like(H)
+    # a group of samples that all got the weight 0 leaves its board free: it stays where it is
+    P[np.ix_(used, used)] = np.linalg.pinv(H[np.ix_(used, used)], rcond=1e-15, hermitian=True)
+    return -P @ g, P
+
+
+def squared_distances(e: np.ndarray, C: np.ndarray) -> np.ndarray:
+    """Return the squared Mahalanobis distances (N,) of errors e (N, 6)."""
+    return np.einsum("ni,ni->n", e, np.linalg.solve(C, e[..., None])[..., 0])
+
+
+def estimate_noise(data: PoseData, fit: Fit, kept: np.ndarray, start: NoiseLevels, *, free_scale: bool) -> NoiseLevels:
+    """Return the scatter of the arm that makes the errors of the samples `kept` (N,) bool most likely.
+
+    Restricted maximum likelihood: that the fit has swallowed part of the errors is reckoned with.
+    """
+    e, J = errors(data, fit)[kept], slopes(data, fit)[kept]
+    M, corner = arm_slopes(data, fit)[kept], data.corner_covariances[kept]
+    J = J[:, :, 0 if free_scale else 1 :]
+
+    def deviance(log_scatter: np.ndarray) -> float:
+        arm = np.repeat(np.exp(2.0 * log_scatter), 3)
+        C = corner + (M * arm) @ np.swapaxes(M, 1, 2)
+        W = np.linalg.inv(C)
+        H = np.einsum("nki,nkl,nlj->ij", J, W, J)
+        g = np.einsum("nki,nkl,nl->i", J, W, e)
+        misfit = np.einsum("ni,nij,nj->", e, W, e) - g @ np.linalg.lstsq(H, g, rcond=None)[0]
+        return float(misfit + np.linalg.slogdet(C)[1].sum() + np.linalg.slogdet(H)[1])
+
+    best = minimize(
+        deviance,
+        np.log([start.arm_m, start.arm_rad]),
+        method="Nelder-Mead",
+        bounds=[(np.log(_MIN_SCATTER), np.log(0.3))] * 2,
+        options={"xatol": 0.02, "fatol": 0.01, "maxfev": 120},
+    )
+    arm_m, arm_rad = np.exp(best.x)
+    return NoiseLevels(arm_m=float(arm_m), arm_rad=float(arm_rad))
+
+
+def leave_one_out(
+    data: PoseData, fit: Fit, C: np.ndarray, kept: np.ndarray, *, free_scale: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return each sample's error (N, 6) under the solution of all other samples kept, and its covariance (N, 6, 6)."""
+    e, J, W = errors(data, fit), slopes(data, fit), np.linalg.inv(C)
+    e_out, C_out = np.empty_like(e), np.empty_like(C)
+    for i in range(len(data)):
+        others = kept.copy()
+        others[i] = False
+        step, P = _step(e[others], J[others], W[others], fit, free_scale)
+        e_out[i] = e[i] + J[i] @ step
+        C_out[i] = C[i] + J[i] @ P @ J[i].T
+    return e_out, C_out
