@@ -7,7 +7,7 @@ each as far as possible from those before it.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -33,8 +33,8 @@ class NoViewpointsError(RuntimeError):
     """The arm cannot look at the board from enough sides."""
 
 
-def _roomy() -> CollisionConfig:
-    return CollisionConfig(transfer_threshold_m=0.010, table_margin_m=0.020, link_margin_m=0.020)
+ROOMY = CollisionConfig(transfer_threshold_m=0.010, table_margin_m=0.020, link_margin_m=0.020)
+"""Distances kept while the mount is not calibrated yet."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -55,14 +55,12 @@ class ViewpointConfig:
     """Views drawn, of which the best are chosen."""
     jaw: float = z1.GRIPPER_CLOSED
     """Mover angle while looking [rad]; closed hides least."""
-    collision: CollisionConfig = field(default_factory=_roomy)
-    """Distances kept: wide, as the mount is not calibrated yet."""
 
     def __post_init__(self) -> None:
         low, high = self.distance_m
-        if not (3 <= self.n <= self.n_drawn and 0.07 <= low < high <= 0.6 and 0.0 < self.max_tilt_deg <= 70.0):
+        if not (1 <= self.n <= self.n_drawn and 0.07 <= low < high <= 0.6 and 0.0 < self.max_tilt_deg <= 70.0):
             raise ValueError(
-                f"n is {self.n}, distance_m {self.distance_m}, max_tilt_deg {self.max_tilt_deg}; allowed are 3 to "
+                f"n is {self.n}, distance_m {self.distance_m}, max_tilt_deg {self.max_tilt_deg}; allowed are 1 to "
                 f"{self.n_drawn} views, 0.07 to 0.6 m, and above 0 to 70°."
             )
 
@@ -80,7 +78,11 @@ class Viewpoint:
 
 
 def look_around(
-    kinematics: Kinematics, frame: RgbdFrame, q: np.ndarray, T_flange_camera: np.ndarray, config: ViewpointConfig
+    kinematics: Kinematics,
+    frame: RgbdFrame,
+    q: np.ndarray,
+    T_flange_camera: np.ndarray = z1.T_FLANGE_CAMERA,
+    config: CollisionConfig | None = None,
 ) -> CollisionChecker:
     """Return what to keep away from: the table and whatever stood higher in `frame`, taken at joints `q` (7,) [rad].
 
@@ -88,21 +90,38 @@ def look_around(
         NoTableError: the table is not in view.
     """
     T_base_camera = kinematics.flange(q[: z1.N_ARM]) @ T_flange_camera
-    depth = OwnGripper().blanked(frame, float(q[-1])).depth_m
+    depth = OwnGripper().blanked(frame, float(q[-1]), T_flange_camera).depth_m
     seen = valid_pixels(depth, _FARTHEST_SEEN_M) & continuous_pixels(depth)
     points = back_project(depth, frame.intrinsics, seen)
     # Fitted, not assumed: a mount that is off its drawing tilts the table, and its far end would be an obstacle
     fit = fit_table(points, expected_table(T_base_camera), TableConfig())
-    points = points[fit.above(points, _OBSTACLE_M)]
+    return _checker(kinematics, frame, T_base_camera, points[fit.above(points, _OBSTACLE_M)], q, config or ROOMY)
+
+
+def table_only(kinematics: Kinematics, frame: RgbdFrame, q: np.ndarray) -> CollisionChecker:
+    """Return what lets the arm at joints `q` (7,) [rad] go wherever it does not hit the table: for the way home."""
+    touching = CollisionConfig(table_margin_m=0.0, link_margin_m=0.0)
+    return _checker(kinematics, frame, kinematics.flange(q[: z1.N_ARM]), np.empty((0, 3)), q, touching)
+
+
+def _checker(  # noqa: PLR0917 - the order of what is known: who, saw what, from where
+    kinematics: Kinematics,
+    frame: RgbdFrame,
+    T_base_camera: np.ndarray,
+    obstacles: np.ndarray,
+    q: np.ndarray,
+    config: CollisionConfig,
+) -> CollisionChecker:
+    """Return a checker for the table and points (N, 3) in the camera frame [m]."""
     observation = Observation(
         frame=frame,
         T_base_camera=T_base_camera,
         detection=Detection(label="board", confidence=1.0, box_px=(0, 0, 0, 0)),
         object_points=np.empty((0, 3)),
-        scene_points=points,
+        scene_points=obstacles,
         table=expected_table(T_base_camera),
     )
-    return CollisionChecker(kinematics, observation, q, config.collision)
+    return CollisionChecker(kinematics, observation, q, config)
 
 
 def find_viewpoints(
@@ -114,6 +133,7 @@ def find_viewpoints(
     *,
     q_start: np.ndarray,
     T_flange_camera: np.ndarray = z1.T_FLANGE_CAMERA,
+    taken: Sequence[np.ndarray] = (),
     config: ViewpointConfig | None = None,
     seed: int = 0,
 ) -> list[Viewpoint]:
@@ -127,6 +147,7 @@ def find_viewpoints(
         corners_m: (N, 3) its corners in its own frame [m].
         q_start: where the tour begins.
         T_flange_camera: (4, 4) the mount as far as it is known.
+        taken: camera poses (4, 4) of views that there are already; the new ones keep away from them.
         config: which views are wanted.
         seed: of the draws; the same arguments give the same views.
 
@@ -135,7 +156,7 @@ def find_viewpoints(
     """
     config = config or ViewpointConfig()
     rng = np.random.default_rng(seed)
-    hidden = OwnGripper().reach_m(intrinsics, config.jaw) > 0.0
+    hidden = OwnGripper().reach_m(intrinsics, config.jaw, T_flange_camera) > 0.0
     T_camera_pivot = inverse(T_flange_camera) @ z1.T_FLANGE_PIVOT
     refused = dict.fromkeys(("out of view", "out of reach", "collision"), 0)
     found: list[Viewpoint] = []
@@ -159,7 +180,7 @@ def find_viewpoints(
             f"only {len(found)} of {config.n_drawn} views of the board can be taken, {config.n} are wanted ({why}). "
             "Lay the board flat, 0.35 to 0.5 m in front of the arm, clear the table around it, or ask for fewer poses."
         )
-    return _tour(_spread(found, config.n), q_start)
+    return _tour(_spread(found, config.n, taken), q_start)
 
 
 def plan_way(
@@ -209,18 +230,23 @@ def _is_clear(checker: CollisionChecker, kinematics: Kinematics, q: np.ndarray) 
     return bool(hits.free()[0])
 
 
-def _spread(views: Sequence[Viewpoint], n: int) -> list[Viewpoint]:
-    """Return `n` of `views`, each the farthest from all chosen before it, beginning with the one that sees most."""
-    R = Rotation.from_matrix([view.T_base_camera[:3, :3] for view in views])
-    p = np.array([view.T_base_camera[:3, 3] for view in views])
-    chosen = [int(np.argmax([view.seen for view in views]))]
+def _spread(views: Sequence[Viewpoint], n: int, taken: Sequence[np.ndarray]) -> list[Viewpoint]:
+    """Return `n` of `views`, each the farthest from all before it: those taken, or else the one that sees most."""
+    Ts = np.array([view.T_base_camera for view in views])
     nearest = np.full(len(views), np.inf)
+    for T in taken:
+        nearest = np.minimum(nearest, _distances(Ts, T))
+    chosen: list[int] = []
     while len(chosen) < n:
-        last = chosen[-1]
-        turn = (R[last].inv() * R).magnitude()
-        nearest = np.minimum(nearest, np.hypot(turn, np.linalg.norm(p - p[last], axis=1) / _METRES_PER_TURN))
-        chosen.append(int(nearest.argmax()))
+        chosen.append(int(nearest.argmax() if np.isfinite(nearest).all() else np.argmax([view.seen for view in views])))
+        nearest = np.minimum(nearest, _distances(Ts, Ts[chosen[-1]]))
     return [views[index] for index in chosen]
+
+
+def _distances(Ts: np.ndarray, T: np.ndarray) -> np.ndarray:
+    """Return how different the views (N, 4, 4) are from `T`, (N,) [rad], travel counted as turning."""
+    turn = (Rotation.from_matrix(T[:3, :3]).inv() * Rotation.from_matrix(Ts[:, :3, :3])).magnitude()
+    return np.hypot(turn, np.linalg.norm(Ts[:, :3, 3] - T[:3, 3], axis=1) / _METRES_PER_TURN)
 
 
 def _tour(views: list[Viewpoint], q_start: np.ndarray) -> list[Viewpoint]:
