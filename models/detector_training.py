@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-import os
+import random
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-os.environ.setdefault("YOLO_OFFLINE", "True")  # read by ultralytics when it is loaded: nothing is fetched or reported
-os.environ.setdefault("YOLO_AUTOINSTALL", "False")
+import cv2
+import numpy as np
+
+from models.detector_weights import ARCHITECTURE, new_network, tame_ultralytics
+
+tame_ultralytics()  # before ultralytics is loaded
 
 import torch  # noqa: E402
 from ultralytics.models.yolo.segment import SegmentationTrainer  # noqa: E402
 from ultralytics.nn.tasks import SegmentationModel  # noqa: E402
-
-ARCHITECTURE = "yolov8n-seg.yaml"
+from ultralytics.utils.instance import Instances  # noqa: E402
+from ultralytics.utils.ops import resample_segments  # noqa: E402
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -28,13 +32,14 @@ class Phase:
     lrf: float
     """Share of `lr0` at the end; a straight line between."""
     warmup_epochs: float
-    batch: int = 16
+    batch: int = 8
 
 
 PHASES = (
-    Phase(imgsz=320, epochs=10, lr0=1.5e-3, lrf=0.35, warmup_epochs=0.7),
-    Phase(imgsz=416, epochs=6, lr0=6e-4, lrf=0.5, warmup_epochs=0.1),
-    Phase(imgsz=640, epochs=3, lr0=3e-4, lrf=0.03, warmup_epochs=0.1),
+    Phase(imgsz=256, epochs=4, lr0=1.0e-3, lrf=0.8, warmup_epochs=0.5),
+    Phase(imgsz=320, epochs=6, lr0=8.0e-4, lrf=0.6, warmup_epochs=0.1),
+    Phase(imgsz=416, epochs=4, lr0=5.0e-4, lrf=0.5, warmup_epochs=0.1),
+    Phase(imgsz=640, epochs=2, lr0=2.5e-4, lrf=0.05, warmup_epochs=0.1),
 )
 """Small pictures teach most of it at a fifth of the time; the last phase has the size at which the network is used."""
 
@@ -52,10 +57,54 @@ AUGMENTATION = {
 """On top of what the scenes vary themselves. No mosaic: four scenes of a quarter's size are not what the arm sees."""
 
 
+CARD_SHARE = 0.2
+"""Share of the pictures with one object in which a card hides some of it."""
+
+
+class HideBehindCard:
+    """Hides up to 55 % of a lone object's extent behind a flat card that comes in from a random side."""
+
+    def __call__(self, labels: dict) -> dict:
+        """Return ultralytics' labels with picture, outline and box changed."""
+        instances = labels["instances"]
+        if len(instances) != 1 or random.random() > CARD_SHARE:
+            return labels
+        outline, angle = instances.segments[0], random.uniform(0.0, 2.0 * np.pi)
+        away = np.array([np.cos(angle), np.sin(angle)])
+        along = outline @ away
+        edge = along.max() - random.uniform(0.1, 0.55) * (along.max() - along.min())
+        left, top, right, bottom = instances.bboxes[0] + np.array([-1, -1, 1, 1]) * random.uniform(2.0, 25.0)
+        card = clip_polygon(np.array([[left, top], [right, top], [right, bottom], [left, bottom]]), -away, -edge)
+        shade = random.choices(range(20, 60), k=3) if random.random() < 0.5 else random.choices(range(256), k=3)
+        labels["img"] = np.ascontiguousarray(labels["img"])
+        cv2.fillPoly(labels["img"], [np.round(card).astype(np.int32)], shade)
+        left_over = clip_polygon(outline, away, edge)
+        box = np.concatenate([left_over.min(axis=0), left_over.max(axis=0)])[None].astype(np.float32)
+        outlines = np.stack(resample_segments([left_over.astype(np.float32)], n=len(outline)))
+        labels["instances"] = Instances(box, outlines, None, bbox_format="xyxy", normalized=False)
+        return labels
+
+
+def clip_polygon(corners: np.ndarray, away: np.ndarray, edge: float) -> np.ndarray:
+    """Return the part (M, 2) of a polygon (N, 2) where `corner @ away <= edge`, by Sutherland and Hodgman's cut.
+
+    A part that falls in two stays joined along the cut.
+    """
+    over = corners @ away - edge
+    kept = []
+    for number in range(len(corners)):
+        here, before = over[number], over[number - 1]
+        if (here > 0) != (before > 0):
+            kept.append(corners[number - 1] + (corners[number] - corners[number - 1]) * before / (before - here))
+        if here <= 0:
+            kept.append(corners[number])
+    return np.array(kept).reshape(-1, 2)
+
+
 class Bf16SegmentationModel(SegmentationModel):
     """The network runs in bfloat16 (twice as fast where the processor has AVX-512 BF16), its loss in float32."""
 
-    def loss(self, batch, preds=None):  # noqa: ANN001, ANN201 - ultralytics' signature
+    def loss(self, batch, preds=None):
         """Return ultralytics' loss and its parts."""
         if preds is None:
             with torch.autocast("cpu", torch.bfloat16):
@@ -66,7 +115,7 @@ class Bf16SegmentationModel(SegmentationModel):
 class CpuSegmentationTrainer(SegmentationTrainer):
     """Ultralytics' trainer without validation between epochs, for a network in bfloat16 and channels-last."""
 
-    def get_model(self, cfg=None, weights=None, verbose=True):  # noqa: ANN001, ANN201
+    def get_model(self, cfg=None, weights=None, verbose=True):
         """Return the network, with `weights` if given."""
         model = Bf16SegmentationModel(cfg, nc=self.data["nc"], ch=self.data["channels"], verbose=False)
         model = self.set_model_names_for_load(model)
@@ -74,13 +123,20 @@ class CpuSegmentationTrainer(SegmentationTrainer):
             model.load(weights)
         return model.to(memory_format=torch.channels_last)
 
+    def build_dataset(self, img_path, mode="train", batch=None):
+        """Return ultralytics' data set; where it augments, cards come after the warp and before the colours."""
+        dataset = super().build_dataset(img_path, mode, batch)
+        if mode == "train":
+            dataset.transforms.insert(1, HideBehindCard())
+        return dataset
+
     def preprocess_batch(self, batch: dict) -> dict:
         """Return the batch with its pictures in channels-last."""
         batch = super().preprocess_batch(batch)
         batch["img"] = batch["img"].contiguous(memory_format=torch.channels_last)
         return batch
 
-    def validate(self):  # noqa: ANN201
+    def validate(self):
         """Skip: held-out pictures are for the measurement after the training alone."""
         return {}, float(self.epoch)
 
@@ -88,7 +144,7 @@ class CpuSegmentationTrainer(SegmentationTrainer):
         """Skip, for the same reason; the checkpoint stays as it is."""
 
 
-def train_phase(phase: Phase, data: Path, folder: Path, start: Path | None, seed: int, threads: int) -> Path:
+def train_phase(phase: Phase, *, data: Path, folder: Path, start: Path | None, seed: int, threads: int) -> Path:
     """Train one phase, or what is left of it, and return its last checkpoint.
 
     Args:
@@ -103,9 +159,14 @@ def train_phase(phase: Phase, data: Path, folder: Path, start: Path | None, seed
     if (folder / "done").exists():
         return last
     settings = asdict(phase) | AUGMENTATION
-    settings |= {"model": ARCHITECTURE, "data": str(data), "seed": seed, "pretrained": str(start) if start else False}
-    settings |= {"project": str(folder.parent), "name": folder.name, "exist_ok": True, "device": "cpu", "workers": 0}
-    settings |= {"optimizer": "AdamW", "weight_decay": 0.005, "nbs": phase.batch, "momentum": 0.9}
+    settings |= {
+        "model": f"{ARCHITECTURE}.yaml",
+        "data": str(data),
+        "seed": seed,
+        "pretrained": str(start) if start else False,
+    }
+    settings |= {"project": str(folder.parent), "name": folder.name, "exist_ok": True, "device": "cpu", "seed": seed}
+    settings |= {"optimizer": "AdamW", "weight_decay": 0.005, "nbs": phase.batch, "momentum": 0.9, "workers": 0}
     settings |= {"rect": True, "amp": False, "val": False, "plots": False, "patience": 0, "close_mosaic": 0}
     settings |= {"warmup_bias_lr": 0.0, "deterministic": True, "resume": str(last) if last.exists() else False}
     trainer = CpuSegmentationTrainer(overrides=settings)
@@ -115,16 +176,15 @@ def train_phase(phase: Phase, data: Path, folder: Path, start: Path | None, seed
     return last
 
 
-def read_checkpoint(path: Path) -> SegmentationModel:
+def read_checkpoint(path: Path) -> torch.nn.Module:
     """Return the averaged weights of a checkpoint of ours in a plain float32 network."""
     saved = torch.load(path, map_location="cpu", weights_only=False)["ema"].float()
-    model = SegmentationModel(ARCHITECTURE, nc=saved.nc, verbose=False)
+    model = new_network(len(saved.names))
     model.load_state_dict(saved.state_dict())
-    model.names = saved.names
-    return model.eval()
+    return model
 
 
-def _to_float(value):  # noqa: ANN001, ANN202 - a nest of whatever the head returns
+def _to_float(value):
     if isinstance(value, torch.Tensor):
         return value.float()
     if isinstance(value, dict):

@@ -21,8 +21,8 @@ import numpy as np
 import tyro
 from rich.progress import track
 
+from sim_twin.detection_props import CLASSES
 from sim_twin.detection_scenes import Label, Picture, SceneMix
-from sim_twin.objects import OBJECT_NAMES
 
 SPLITS = {"train": 1_000_000, "val": 2_000_000, "empty": 3_000_000}
 """Name to the first seed: no two splits share a seed, so neither props, textures nor lights."""
@@ -114,7 +114,7 @@ def make_shard(shard: Shard) -> None:
 
 def write_manifest(config: Config) -> None:
     """Write `data.yaml`, which ultralytics reads, and `recipe.json`."""
-    names = "".join(f"  {number}: {name}\n" for number, name in enumerate(OBJECT_NAMES))
+    names = "".join(f"  {number}: {name}\n" for number, name in enumerate(CLASSES))
     folders = "".join(f"{split}: images/{split}\n" for split in ("train", "val"))
     (config.out / "data.yaml").write_text(f"path: {config.out.resolve()}\n{folders}names:\n{names}")
     recipe = {key: value for key, value in asdict(config).items() if key not in ("out", "jobs")}
@@ -135,7 +135,7 @@ def to_line(label: Label) -> str:
     parts = parts or [np.repeat(outlines[0].reshape(-1, 2), 3, axis=0)[:3]]
     corners = parts[0] if len(parts) == 1 else np.concatenate(merge_multi_segment([p.ravel().tolist() for p in parts]))
     shares = (corners + 0.5) / [width, height]
-    return f"{OBJECT_NAMES.index(label.name)} " + " ".join(f"{share:.5f}" for share in shares.ravel())
+    return f"{CLASSES.index(label.name)} " + " ".join(f"{share:.5f}" for share in shares.ravel())
 
 
 def _write_picture(picture: Picture, image: Path, labels: Path) -> None:

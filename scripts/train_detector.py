@@ -16,7 +16,7 @@ from pathlib import Path
 import tyro
 
 from models.detector_weights import WEIGHTS_FOLDER
-from sim_twin.objects import OBJECT_NAMES
+from sim_twin.detection_props import CLASSES
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,7 +37,7 @@ class Config:
 
 def main(config: Config) -> None:
     """Train what is not trained yet, and write the weights."""
-    from models.detector_training import ARCHITECTURE, AUGMENTATION, PHASES, read_checkpoint, train_phase
+    from models.detector_training import ARCHITECTURE, AUGMENTATION, CARD_SHARE, PHASES, read_checkpoint, train_phase
     from models.detector_weights import save_detector
 
     manifest = config.data / "data.yaml"
@@ -46,11 +46,16 @@ def main(config: Config) -> None:
     checkpoint = None
     for number, phase in enumerate(PHASES):
         folder = (config.run / f"{number}_{phase.imgsz}").resolve()
-        checkpoint = train_phase(phase, manifest, folder, checkpoint, config.seed, config.threads)
+        checkpoint = train_phase(
+            phase, data=manifest, folder=folder, start=checkpoint, seed=config.seed, threads=config.threads
+        )
     assert checkpoint is not None
-    digest = save_detector(config.weights, read_checkpoint(checkpoint), OBJECT_NAMES)
+    digest = save_detector(config.weights, read_checkpoint(checkpoint), CLASSES)
     recipe = {"architecture": ARCHITECTURE, "seed": config.seed, "phases": [asdict(phase) for phase in PHASES]}
-    recipe |= {"augmentation": AUGMENTATION, "data": json.loads((config.data / "recipe.json").read_text())}
+    recipe |= {
+        "augmentation": AUGMENTATION | {"card": CARD_SHARE},
+        "data": json.loads((config.data / "recipe.json").read_text()),
+    }
     recipe |= {"losses": _read_losses(config.run), "versions": _versions()}
     config.weights.with_suffix(".recipe.json").write_text(json.dumps(recipe, indent=1) + "\n")
     print(f"wrote {config.weights} ({config.weights.stat().st_size / 1e6:.1f} MB, SHA-256 {digest[:12]}…)")

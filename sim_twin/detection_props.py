@@ -11,6 +11,8 @@ import numpy as np
 from sim_twin.objects import OBJECTS, Part, lathe
 from sim_twin.z1_mjcf import GROUP_SCENE
 
+CLASSES = ("bottle", "box", "cylinder")
+"""What the detector tells apart, in the order of the labels' numbers."""
 HIDDEN_GROUP = 5
 """Geoms of this group are not drawn."""
 
@@ -22,7 +24,7 @@ class Prop:
     """A thing that a scene may show, made of convex parts in its own frame (origin at mid-height, z up)."""
 
     kind: str
-    """A class of `sim_twin.objects.OBJECT_NAMES`, or what else it is."""
+    """One of `CLASSES`, or what else it is."""
     parts: tuple[tuple[Part, np.ndarray], ...]
     """Each part with its pose (4, 4) in the prop."""
 

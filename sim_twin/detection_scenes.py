@@ -10,8 +10,8 @@ import numpy as np
 
 from hal import z1
 from sim_twin.d405 import measure_colour
+from sim_twin.detection_props import CLASSES
 from sim_twin.detection_stage import Actor, Stage
-from sim_twin.objects import OBJECT_NAMES
 from sim_twin.photo import spoil_photo
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ class Label:
     """One object that a picture shows."""
 
     name: str
-    """One of `sim_twin.objects.OBJECT_NAMES`."""
+    """One of `sim_twin.detection_props.CLASSES`."""
     mask: np.ndarray
     """(H, W) bool, its visible pixels."""
 
@@ -78,7 +78,7 @@ def draw_scene(stage: Stage, rng: np.random.Generator, mix: SceneMix | None = No
     camera = "wrist" if by_wrist else "free"
     T_base_camera, centre = _place_camera(stage, by_wrist, rng)
     objects = [] if rng.random() < mix.empty else _choose_objects(stage, as_twin, rng)
-    places = _place_objects(stage, objects, T_base_camera, centre, by_wrist, rng)
+    places = _place_objects(stage, objects, T_base_camera, centre=centre, by_wrist=by_wrist, rng=rng)
     _place_distractors(stage, places, T_base_camera, centre, rng)
     if places and rng.random() < mix.occluded:
         _place_occluder(stage, places[0], T_base_camera, rng)
@@ -119,7 +119,7 @@ def outline_area(corners: list[np.ndarray], T_base_camera: np.ndarray, intrinsic
         if z.min() < _NEAREST_M:
             return np.inf
         pixels = np.column_stack([x / z * intrinsics.fx + intrinsics.cx, y / z * intrinsics.fy + intrinsics.cy])
-        hull = cv2.convexHull(((pixels + [width, height]) / 2).astype(np.float32))
+        hull = cv2.convexHull(((pixels + np.array([width, height])) / 2).astype(np.float32))
         cv2.fillConvexPoly(canvas, np.round(np.clip(hull, -9999, 9999)).astype(np.int32), 1)
     return 4.0 * float(canvas.sum())
 
@@ -225,7 +225,7 @@ def _choose_objects(stage: Stage, as_twin: bool, rng: np.random.Generator) -> li
     """One to three objects; in the twin's look always the benchmark's own."""
     chosen: list[Actor] = []
     for _ in range(rng.choice([1, 2, 3], p=[0.55, 0.3, 0.15])):
-        actors = stage.named(str(rng.choice(OBJECT_NAMES)))
+        actors = stage.named(str(rng.choice(CLASSES)))
         nominal = as_twin or rng.random() < 0.35
         actor = actors[0] if nominal else actors[rng.integers(1, len(actors))]
         if actor not in chosen:
@@ -265,6 +265,7 @@ def _place_objects(
     stage: Stage,
     objects: list[Actor],
     T_base_camera: np.ndarray,
+    *,
     centre: np.ndarray,
     by_wrist: bool,
     rng: np.random.Generator,
@@ -277,7 +278,7 @@ def _place_objects(
             xy = centre[:2] + rng.normal(0.0, spread, 2)
             above = rng.uniform(0.01, 0.15) if rng.random() < 0.08 else 0.0  # lifted, or falling
             pose = _standing_at(actor, xy, _random_lean(rng), above)
-            if _fits(stage, actor, pose, poses, T_base_camera, by_wrist):
+            if _fits(stage, actor, pose, others=poses, T_base_camera=T_base_camera, by_wrist=by_wrist):
                 stage.put(actor, pose)
                 poses.append(pose)
                 break
@@ -290,6 +291,7 @@ def _fits(
     stage: Stage,
     actor: Actor,
     pose: np.ndarray,
+    *,
     others: list[np.ndarray],
     T_base_camera: np.ndarray,
     by_wrist: bool,

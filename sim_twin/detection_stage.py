@@ -13,9 +13,16 @@ import numpy as np
 
 from hal.messages import Intrinsics
 from sim_twin.d405 import INTRINSICS
-from sim_twin.detection_props import HIDDEN_GROUP, Prop, add_prop, make_class_prop, make_distractor, nominal_prop
+from sim_twin.detection_props import (
+    CLASSES,
+    HIDDEN_GROUP,
+    Prop,
+    add_prop,
+    make_class_prop,
+    make_distractor,
+    nominal_prop,
+)
 from sim_twin.gl import Canvas
-from sim_twin.objects import OBJECT_NAMES
 from sim_twin.render import set_pinhole
 from sim_twin.scene import TABLE_RGBA
 from sim_twin.textures import random_rgb, random_texture
@@ -71,7 +78,7 @@ class Stage:
 
     def distractors(self) -> list[Actor]:
         """Return the actors of no class."""
-        return [actor for actor in self.actors if actor.prop.kind not in OBJECT_NAMES]
+        return [actor for actor in self.actors if actor.prop.kind not in CLASSES]
 
     def clear(self) -> None:
         """Take every actor off the stage."""
@@ -148,7 +155,9 @@ class Stage:
             self._dress_actor(actor, rng)
         tint = np.append(rng.uniform(0.75, 1.2, 3) if rng.random() < 0.5 else np.ones(3), 1.0)
         grey = rng.uniform(0.0, 0.15)
-        self.model.geom_rgba[self._arm_geoms()] = np.clip((self._arm_rgba() + [grey, grey, grey, 0]) * tint, 0, 1)
+        self.model.geom_rgba[self._arm_geoms()] = np.clip(
+            (self._arm_rgba() + np.array([grey, grey, grey, 0])) * tint, 0, 1
+        )
         self._light_at_random(rng)
 
     def draw(self, camera: str, arm: str, shadows: bool) -> np.ndarray:
@@ -281,8 +290,8 @@ def _build(rng: np.random.Generator) -> tuple[mujoco.MjModel, list[Actor]]:
     _add_materials(spec)
     _add_room(spec)
     add_z1(spec)
-    props = [nominal_prop(name) for name in OBJECT_NAMES]
-    props += [make_class_prop(name, rng) for name in OBJECT_NAMES for _ in range(VARIANTS)]
+    props = [nominal_prop(name) for name in CLASSES]
+    props += [make_class_prop(name, rng) for name in CLASSES for _ in range(VARIANTS)]
     props += [make_distractor(rng) for _ in range(DISTRACTORS)]
     geoms = [add_prop(spec, prop, f"prop_{number}") for number, prop in enumerate(props)]
     model = spec.compile()

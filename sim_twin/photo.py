@@ -7,6 +7,7 @@ import numpy as np
 
 _DARK = 45.0
 
+
 def spoil_photo(colour: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Return `colour` (H, W, 3) uint8 RGB with random flaws of a cheap camera in a badly lit room.
 
@@ -25,7 +26,9 @@ def spoil_photo(colour: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     spoilt = _with_noise(picture, rng.uniform(0.5, 9.0), rng)
     if rng.random() < 0.4:
         quality = [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(35, 90))]
-        spoilt = cv2.imdecode(cv2.imencode(".jpg", spoilt, quality)[1], cv2.IMREAD_COLOR)
+        decoded = cv2.imdecode(cv2.imencode(".jpg", spoilt, quality)[1], cv2.IMREAD_COLOR)
+        assert decoded is not None
+        return np.asarray(decoded)
     return spoilt
 
 
@@ -53,13 +56,11 @@ def _motion_blur(picture: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     kernel = np.zeros((length, length), np.float32)
     angle, middle = rng.uniform(0, np.pi), (length - 1) / 2
     along = middle * np.array([np.cos(angle), np.sin(angle)])
-    ends = [tuple(int(round(a)) for a in middle + side * along) for side in (-1, 1)]
+    ends = [tuple(round(a) for a in middle + side * along) for side in (-1, 1)]
     cv2.line(kernel, ends[0], ends[1], 1.0)
     return cv2.filter2D(picture, -1, kernel / kernel.sum())
 
 
 def _with_noise(picture: np.ndarray, sd: float, rng: np.random.Generator) -> np.ndarray:
-    noise = np.empty(picture.shape, np.float32)
-    cv2.setRNGSeed(int(rng.integers(2**31)))
-    cv2.randn(noise, 0.0, float(sd))
-    return np.clip(picture + noise, 0, 255).astype(np.uint8)
+    noise = rng.standard_normal(picture.shape, dtype=np.float32)
+    return np.clip(picture + np.float32(sd) * noise, 0, 255).astype(np.uint8)
