@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal, get_args
 
 import numpy as np
 
-from models.graspgen.cloud import prepare_cloud
+from models.graspgen.cloud import ViewCloud, prepare_cloud
+from models.graspgen.selection import choose_grasps
 from models.torch_threads import single_threaded_workers
 from models.types import GraspSet, check_object_cloud
+
+Device = Literal["auto", "cpu", "cuda"]
+_MIN_WIDTH_M = 0.002
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -20,12 +27,16 @@ class DiffusionConfig:
     """The hand the weights were trained for; they lie in `models/weights/graspgen_<gripper>.npz`."""
     weights: Path | None = None
     """Another weights file, its checksum beside it."""
-    steps: int = 6
+    steps: int = 5
     """Denoising steps."""
     temperature: float = 1.0
     """Spread of the starting noise; below 1 grasps are safer and less varied."""
+    drawn: float = 1.5
+    """Grasps drawn for each that is given out: the discriminator keeps the rest back. 1 gives out all."""
     threads: int = 2
-    """Parts that the grasps are denoised in, side by side."""
+    """Parts that the grasps are denoised in, side by side, on a CPU."""
+    device: Device = "auto"
+    """Where the networks run; `auto` takes CUDA where there is."""
     max_width_m: float = 0.136
     """Widths are given up to this opening [m]."""
 
@@ -36,6 +47,10 @@ class DiffusionConfig:
             raise ValueError(f"threads is {self.threads}; allowed is 1 to 64.")
         if not 0.0 < self.temperature <= 1.5:
             raise ValueError(f"temperature is {self.temperature}; allowed is above 0, up to 1.5.")
+        if not 1.0 <= self.drawn <= 10.0:
+            raise ValueError(f"drawn is {self.drawn}; allowed is 1 to 10.")
+        if self.device not in get_args(Device):
+            raise ValueError(f"device is {self.device!r}; allowed: {', '.join(get_args(Device))}.")
 
 
 class DiffusionSampler:
@@ -51,52 +66,118 @@ class DiffusionSampler:
 
         Raises:
             WeightsError: they are missing, damaged or of another network.
+            ValueError: CUDA is asked for where there is none.
         """
         from models.graspgen.weights import load_weights, weights_path
 
         self.config = config or DiffusionConfig()
+        self._device = _pick_device(self.config.device)
         path = self.config.weights or weights_path(self.config.gripper)
-        self._generator, self._discriminator = load_weights(path)
+        self._generator, self._discriminator = (network.to(self._device) for network in load_weights(path))
         self._workers = single_threaded_workers(self.config.threads, "graspgen")
         # What the first call compiles and allocates shall not be waited for when an object stands there.
         self.sample(np.random.default_rng(0).uniform([-0.03, -0.08, 0.39], [0.05, 0.08, 0.40], (600, 3)), 800, 0)
 
+    @property
+    def device(self) -> str:
+        """Where the networks run: `cpu` or `cuda`."""
+        return self._device
+
     def sample(self, points: np.ndarray, n: int, seed: int) -> GraspSet:
         """Return `n` grasps for `points` (M, 3) [m] seen from their origin, best score first.
+
+        They are the best of `drawn` times as many; see `choose_grasps`. On one device the same seed gives the same
+        grasps.
 
         Raises:
             ValueError: fewer than 30 points, points not finite, all in one place, or not in metres.
         """
-        points = check_object_cloud(points, n)
-        rng = np.random.default_rng(seed)
-        cloud = prepare_cloud(points, rng)
-        T_view_grasps, widths, scores = self._denoise(cloud.points, cloud.normals, n, rng)
-        order = np.argsort(-scores, kind="stable")
+        return self.sample_batch([points], n, seed)[0]
+
+    def sample_batch(self, clouds: Sequence[np.ndarray], n: int, seed: int) -> list[GraspSet]:
+        """Return for each of several objects what `sample` returns for its cloud; on a GPU all are denoised at once.
+
+        Raises:
+            ValueError: as `sample`; for several clouds it says which one (from 0).
+        """
+        grasps = []
+        for cloud, T, widths, scores in self._draw(clouds, math.ceil(self.config.drawn * n), seed):
+            chosen = choose_grasps(T, scores, n)
+            grasps.append(self._as_set(cloud, T[chosen], widths[chosen], scores[chosen]))
+        return grasps
+
+    def draw(self, points: np.ndarray, n: int, seed: int) -> GraspSet:
+        """Return the generator's own `n` grasps as they come, scored, none kept back.
+
+        Raises:
+            ValueError: as `sample`.
+        """
+        return self._as_set(*self._draw([points], n, seed)[0])
+
+    def _as_set(self, cloud: ViewCloud, T: np.ndarray, widths: np.ndarray, scores: np.ndarray) -> GraspSet:
         return GraspSet(
-            T_camera_grasps=cloud.T_camera_view @ T_view_grasps[order],
-            scores=scores[order],
-            widths_m=np.clip(widths[order], 0.002, self.config.max_width_m),
+            T_camera_grasps=cloud.T_camera_view @ T,
+            scores=scores,
+            widths_m=np.clip(widths, _MIN_WIDTH_M, self.config.max_width_m),
             source=f"diffusion-{self.config.gripper}",
         )
 
-    def _denoise(
-        self, points: np.ndarray, normals: np.ndarray, n: int, rng: np.random.Generator
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return poses (n, 4, 4) in the view frame, widths (n,) [m] and scores (n,)."""
+    def _draw(self, clouds: Sequence[np.ndarray], n: int, seed: int) -> list[tuple[ViewCloud, *tuple[np.ndarray, ...]]]:
+        """Return for each cloud how the networks saw it, poses (n, 4, 4) in its frame, widths (n,) [m], scores (n,)."""
+        from models.graspgen.network import N_COORDINATES
+
+        checked = _checked(clouds, n)
+        seen, noise = [], []
+        for points in checked:
+            rng = np.random.default_rng(seed)
+            seen.append(prepare_cloud(points, rng))
+            noise.append(self.config.temperature * rng.standard_normal((n, N_COORDINATES)))
+        inputs = np.stack([np.concatenate([cloud.points, cloud.normals], axis=1) for cloud in seen])
+        return list(zip(seen, *self._denoise(inputs, np.stack(noise)), strict=True))
+
+    def _denoise(self, clouds: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return poses (B, n, 4, 4), widths (B, n) [m] and scores (B, n) for clouds (B, 512, 6), noise (B, n, 10)."""
         import torch
 
-        from models.graspgen.network import N_COORDINATES, decode_grasps
+        from models.graspgen.network import decode_grasps
 
-        cloud = torch.from_numpy(np.concatenate([points, normals], axis=1).astype(np.float32))[None]
-        noise = self.config.temperature * rng.standard_normal((1, n, N_COORDINATES))
-
-        def denoise(part: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        def denoise(job: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+            cloud, start = (torch.from_numpy(array.astype(np.float32)).to(self._device) for array in job)
             with torch.inference_mode():
-                grasps = self._generator.sample(cloud, torch.from_numpy(part.astype(np.float32)), self.config.steps)
+                grasps = self._generator.sample(cloud, start, self.config.steps)
                 scores = torch.sigmoid(self._discriminator(cloud, grasps))
-                T, widths = decode_grasps(grasps[0].double())
-            return T.numpy(), widths.numpy(), scores[0].double().numpy()
+                T, widths = decode_grasps(grasps.flatten(0, 1).cpu().double())
+            return T.numpy(), widths.numpy(), scores.flatten().cpu().double().numpy()
 
-        parts = np.array_split(noise, min(self.config.threads, n), axis=1)
-        T, widths, scores = zip(*self._workers.map(denoise, parts), strict=True)
-        return np.concatenate(T), np.concatenate(widths), np.concatenate(scores)
+        jobs = [(clouds, noise)]  # a GPU wants all at once, a CPU one part for each core
+        if self._device == "cpu":
+            split = min(self.config.threads, noise.shape[1])
+            jobs = [
+                (clouds[b : b + 1], part)
+                for b in range(len(clouds))
+                for part in np.array_split(noise[b : b + 1], split, axis=1)
+            ]
+        T, widths, scores = (np.concatenate(parts) for parts in zip(*self._workers.map(denoise, jobs), strict=True))
+        shape = noise.shape[:2]
+        return T.reshape(*shape, 4, 4), widths.reshape(shape), scores.reshape(shape)
+
+
+def _checked(clouds: Sequence[np.ndarray], n: int) -> list[np.ndarray]:
+    if not len(clouds):
+        raise ValueError("No cloud was given; give at least one object's points.")
+    checked = []
+    for index, points in enumerate(clouds):
+        try:
+            checked.append(check_object_cloud(points, n))
+        except ValueError as err:
+            raise ValueError(f"Cloud {index} of {len(clouds)}: {err}" if len(clouds) > 1 else str(err)) from err
+    return checked
+
+
+def _pick_device(wanted: Device) -> str:
+    import torch
+
+    there = torch.cuda.is_available()
+    if wanted == "cuda" and not there:
+        raise ValueError("device is 'cuda', but torch finds no CUDA device here; take 'auto' or 'cpu'.")
+    return "cuda" if there and wanted != "cpu" else "cpu"

@@ -2,12 +2,15 @@
 
 import subprocess
 import sys
+from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from models.graspgen.labels import GRIPPERS, check_grasps
 from models.graspgen.sampler import DiffusionConfig, DiffusionSampler
+from models.graspgen.selection import choose_grasps
 from models.graspgen.shapes import make_shape
 from models.graspgen.views import ViewConfig, render_view
 from models.graspgen.weights import WeightsError
@@ -71,10 +74,62 @@ def test_most_grasps_of_unseen_bottles_hold_and_the_best_scored_more_than_the_wo
     assert np.median(width_errors) < 0.012
 
 
+def test_drawing_more_than_are_given_out_gives_better_ones_of_as_many_kinds(sampler):
+    drawn_valid, chosen_valid, drawn_kinds, chosen_kinds = [], [], [], []
+    for seed in range(70, 78):
+        solid, points, T_camera_object = a_bottle(seed)
+        T_object_camera = np.linalg.inv(T_camera_object)
+        for grasps, valid, kinds in (
+            (sampler.draw(points, 200, 0), drawn_valid, drawn_kinds),
+            (sampler.sample(points, 200, 0), chosen_valid, chosen_kinds),
+        ):
+            good = check_grasps(solid, T_object_camera @ grasps.T_camera_grasps, GRIPPERS["agnostic"]).valid
+            valid.append(good.mean())
+            kinds.append(len(np.unique(np.round(2.0 * grasps.T_camera_grasps[good, :3, 2]), axis=0)))
+    assert np.mean(chosen_valid) > np.mean(drawn_valid) + 0.03
+    assert np.mean(chosen_kinds) > 0.97 * np.mean(drawn_kinds)
+
+
+def test_of_many_alike_the_best_go_first_and_the_best_of_another_kind_is_not_forgotten():
+    T = np.tile(np.eye(4), (11, 1, 1))
+    T[:, :3, 3] = (0.01, 0.01, 0.01)
+    T[10, :3, 3] = (0.10, 0.01, 0.01)
+    scores = np.append(np.linspace(0.9, 0.8, 10), 0.5)
+    assert choose_grasps(T, scores, 3).tolist() == [0, 1, 10]  # the third of a kind is worth its score, no more
+    assert choose_grasps(T, scores, 11).tolist() == list(range(11))
+
+
+def test_several_objects_get_what_each_would_get_alone(sampler):
+    clouds = [a_bottle(seed)[1] for seed in (0, 1, 2)]
+    for points, grasps in zip(clouds, sampler.sample_batch(clouds, 40, 7), strict=True):
+        alone = sampler.sample(points, 40, 7)
+        assert np.array_equal(grasps.T_camera_grasps, alone.T_camera_grasps)
+        assert np.array_equal(grasps.scores, alone.scores)
+
+
+def test_a_batch_says_which_cloud_it_cannot_take(sampler):
+    good = a_bottle(0)[1]
+    with pytest.raises(ValueError, match=r"Cloud 1 of 2.*millimetres"):
+        sampler.sample_batch([good, 1000.0 * good], 10, 0)
+    with pytest.raises(ValueError, match="No cloud"):
+        sampler.sample_batch([], 10, 0)
+
+
+def test_cuda_is_used_when_there_and_refused_when_not():
+    if torch.cuda.is_available():
+        assert DiffusionSampler().device == "cuda"
+    else:
+        with pytest.raises(ValueError, match="no CUDA device"):
+            DiffusionSampler(DiffusionConfig(device="cuda"))
+
+
 @pytest.mark.parametrize(
     ("points", "message"),
     [
+        (np.zeros((0, 3)), "30 points"),
         (np.zeros((5, 3)), "30 points"),
+        (np.zeros((100, 2)), "30 points"),
+        (np.full((100, 3), np.inf), "infinite"),
         (np.full((100, 3), np.nan), "NaN"),
         (np.tile([0.0, 0.0, 0.4], (100, 1)), "spans"),
         (np.random.default_rng(0).normal(size=(100, 3)) * 30.0, "millimetres"),
@@ -86,8 +141,10 @@ def test_clouds_that_cannot_be_grasped_are_refused(sampler, points, message):
 
 
 def test_nonsense_settings_and_missing_weights_are_refused(tmp_path):
-    with pytest.raises(ValueError, match="steps"):
-        DiffusionConfig(steps=0)
+    nonsense: dict[str, Any] = {"steps": 0, "threads": 0, "temperature": 0.0, "drawn": 0.5, "device": "tpu"}
+    for setting, value in nonsense.items():
+        with pytest.raises(ValueError, match=setting):
+            DiffusionConfig(**{setting: value})
     with pytest.raises(WeightsError, match="missing"):
         DiffusionSampler(DiffusionConfig(weights=tmp_path / "none.npz"))
 
