@@ -73,7 +73,8 @@ class DiffusionSampler:
         self.config = config or DiffusionConfig()
         self._device = _pick_device(self.config.device)
         path = self.config.weights or weights_path(self.config.gripper)
-        self._generator, self._discriminator = (network.to(self._device) for network in load_weights(path))
+        generator, discriminator = load_weights(path)
+        self._generator, self._discriminator = generator.to(self._device), discriminator.to(self._device)
         self._workers = single_threaded_workers(self.config.threads, "graspgen")
         # What the first call compiles and allocates shall not be waited for when an object stands there.
         self.sample(np.random.default_rng(0).uniform([-0.03, -0.08, 0.39], [0.05, 0.08, 0.40], (600, 3)), 800, 0)
