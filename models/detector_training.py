@@ -38,8 +38,8 @@ class Phase:
 PHASES = (
     Phase(imgsz=256, epochs=4, lr0=1.0e-3, lrf=0.8, warmup_epochs=0.5),
     Phase(imgsz=320, epochs=6, lr0=8.0e-4, lrf=0.6, warmup_epochs=0.1),
-    Phase(imgsz=416, epochs=4, lr0=5.0e-4, lrf=0.5, warmup_epochs=0.1),
-    Phase(imgsz=640, epochs=2, lr0=2.5e-4, lrf=0.05, warmup_epochs=0.1),
+    Phase(imgsz=416, epochs=2, lr0=5.0e-4, lrf=0.5, warmup_epochs=0.1),
+    Phase(imgsz=640, epochs=1, lr0=2.5e-4, lrf=0.05, warmup_epochs=0.1),
 )
 """Small pictures teach most of it at a fifth of the time; the last phase has the size at which the network is used."""
 

@@ -138,6 +138,18 @@ def to_line(label: Label) -> str:
     return f"{CLASSES.index(label.name)} " + " ".join(f"{share:.5f}" for share in shares.ravel())
 
 
+def read_labels(path: Path, shape: tuple[int, int]) -> tuple[Label, ...]:
+    """Return the labels of a file that `to_line` wrote, for a picture of `shape` (H, W)."""
+    labels = []
+    for line in path.read_text().splitlines():
+        number, *shares = line.split()
+        corners = np.array(shares, dtype=float).reshape(-1, 2) * shape[::-1]
+        mask = np.zeros(shape, np.uint8)
+        cv2.fillPoly(mask, [corners.astype(np.int32)], 1)
+        labels.append(Label(name=CLASSES[int(number)], mask=mask.astype(bool)))
+    return tuple(labels)
+
+
 def _write_picture(picture: Picture, image: Path, labels: Path) -> None:
     quality = [cv2.IMWRITE_JPEG_QUALITY, 92]
     cv2.imwrite(str(image), cv2.cvtColor(picture.colour, cv2.COLOR_RGB2BGR), quality)
