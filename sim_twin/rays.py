@@ -82,7 +82,8 @@ class RayRenderer:
         colour, z_m, geoms = self._caster.cast(data, T_base_camera)
         if self._board is not None:
             seen = geoms == self._print
-            colour[seen] = project_print(self._board, self._intrinsics, T_base_camera)[seen][:, None]
+            share = project_print(self._board, self._intrinsics, T_base_camera)[seen][:, None] / 255.0
+            colour[seen] = np.round(share * colour[seen])
         return View(colour=colour, z_m=z_m, mask=self._is_object[geoms])
 
     def close(self) -> None:
