@@ -9,6 +9,8 @@ from __future__ import annotations
 import time
 from typing import Protocol
 
+_OTHERS_BEGAN_S = 1.6e9  # long after 1970: librealsense takes small stamps for nonsense and no longer pairs frames
+
 
 class Clock(Protocol):
     """Monotonic time in seconds."""
@@ -35,11 +37,12 @@ class WallClock:
 
 
 def unix_offset_s(clock: Clock) -> float:
-    """Return what to add to a time of `clock` to get Unix time [s]; 0 for any clock but the wall's.
+    """Return what to add to a time of `clock` to get Unix time [s].
 
-    Only for devices that stamp their data with the system's time, which may jump: ask each time.
+    Only for devices that stamp their data with the system's time, which may jump: ask each time. Clocks other than the
+    wall's begin at one fixed moment.
     """
-    return time.time() - time.monotonic() if isinstance(clock, WallClock) else 0.0
+    return time.time() - time.monotonic() if isinstance(clock, WallClock) else _OTHERS_BEGAN_S
 
 
 class ManualClock:

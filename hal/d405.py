@@ -120,12 +120,11 @@ class Look:
     """The right imager's."""
     brightness: float = 1.0
     """Of all pictures, relative to what auto-exposure would give: exposure time × gain."""
-    auto_exposure: bool = True
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Exposure:
-    """What the optics saw at one instant; images that were not asked for may be None."""
+    """What the optics saw at one instant; an image that is None is not delivered."""
 
     number: int
     """That of the `Look`; a source that hangs repeats the last."""

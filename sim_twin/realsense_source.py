@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from typing import Self
 
 import cv2
 import mujoco
@@ -58,6 +59,10 @@ class TwinSource:
         """
         return self._thread.submit(self._expose, look).result()
 
+    def warm_up(self, width: int = 848, height: int = 480) -> None:
+        """Open the renderer and draw once, so that the first frame is as quick as the others."""
+        self.expose(Look(number=0, width=width, height=height, depth=True, colour=True))
+
     def reset(self) -> None:
         """Nothing hangs in here."""
 
@@ -65,6 +70,12 @@ class TwinSource:
         """Free the renderer; call it after `unplug`."""
         self._thread.submit(self._close_renderer).result()
         self._thread.shutdown()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
     def _expose(self, look: Look) -> Exposure:
         stamp_s = self.clock.now_s()

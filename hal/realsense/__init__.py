@@ -7,6 +7,8 @@ twin plugged in, they see the twin alone, as a D405 through librealsense's own `
 from hal.realsense.library import *  # noqa: F403 - every public name of pyrealsense2
 
 # isort: split
+import sys
+
 from hal.realsense.api import config as config
 from hal.realsense.api import context as context
 from hal.realsense.api import frame_queue as frame_queue
@@ -20,3 +22,5 @@ from hal.realsense.port import masquerade as masquerade
 from hal.realsense.port import plug as plug
 from hal.realsense.port import plugged as plugged
 from hal.realsense.port import unplug as unplug
+
+pyrealsense2 = sys.modules[__name__]  # `from pyrealsense2 import pyrealsense2` is this module too

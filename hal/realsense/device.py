@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import threading
 from collections.abc import Callable
@@ -14,6 +15,8 @@ from hal.clock import unix_offset_s
 from hal.d405 import Calibration, Exposure, FrameSource, Look
 from hal.messages import Intrinsics
 from hal.realsense.library import native as rs
+
+logger = logging.getLogger(__name__)
 
 SERIAL = "000000000405"
 """Of a twin, unless told otherwise: of the right length, and no real unit's."""
@@ -131,10 +134,15 @@ class TwinDevice:
 
     def _run(self) -> None:
         clock = self.source.clock
-        while not self._ended.is_set():
-            number, due_s = self._next_instant(clock.now_s())
-            clock.sleep_until(due_s)
-            self._deliver(number)
+        try:
+            while not self._ended.is_set():
+                number, due_s = self._next_instant(clock.now_s())
+                clock.sleep_until(due_s)
+                self._deliver(number)
+                self._tell_presence()
+        except Exception:
+            logger.exception("the optics of the twin %s failed; it has left the bus", self.serial)
+            self._ended.set()
             self._tell_presence()
 
     def _tell_presence(self) -> None:
@@ -145,8 +153,8 @@ class TwinDevice:
 
     def _next_instant(self, now_s: float) -> tuple[int, float]:
         """Return number and time [s] of the next frame; without streams, of the next look whether there are some."""
-        profiles = self._sensor.get_active_streams()
-        streams = [(p.stream_type(), p.stream_index(), p.format(), p.fps()) for p in profiles]
+        profiles = self._active()
+        streams = [_key(profile) for profile in profiles]
         if self._first_s is None or streams != self._streams:
             self._first_s, self._streams = now_s, streams
         if not streams:
@@ -157,18 +165,21 @@ class TwinDevice:
         return number, self._first_s + number / rate_hz
 
     def _deliver(self, number: int) -> None:
-        profiles = [p.as_video_stream_profile() for p in self._sensor.get_active_streams()]
+        profiles = self._active()
         if not profiles or not self.present:
             return
         exposure = self.source.expose(self._look(number, profiles))
         if exposure is None:
             return
         with self.lock:
-            active = {p.unique_id() for p in self._sensor.get_active_streams()}
+            active = {_key(profile) for profile in self._active()}
             for profile in profiles:
-                if profile.unique_id() in active:  # else it was stopped while the picture was made
+                if _key(profile) in active:  # else it was stopped while the picture was made
                     self._set_metadata(exposure)
                     self._inject(profile, exposure)
+
+    def _active(self) -> list:
+        return [profile.as_video_stream_profile() for profile in self._sensor.get_active_streams()]
 
     def _look(self, number: int, profiles: list) -> Look:
         wanted = {(p.stream_type(), p.stream_index()) for p in profiles}
@@ -206,12 +217,16 @@ class TwinDevice:
         bytes_per_pixel, conversion = _FORMATS[stream, index][profile.format()]
         size = (profile.height(), profile.width())
         if stream == rs.stream.depth:
-            image = _checked(exposure.depth, size, np.uint16, "depth")
+            name, shape, dtype = "depth", size, np.uint16
         else:
             name = "colour" if stream == rs.stream.color else "right" if index == 2 else "left"
-            image = _checked(getattr(exposure, name), (*size, 3), np.uint8, name)
-            if conversion is not None:
-                image = cv2.cvtColor(image, conversion)
+            shape, dtype = (*size, 3), np.uint8
+        image = getattr(exposure, name)
+        if image is None:
+            return
+        image = _checked(image, shape, dtype, name)
+        if conversion is not None:
+            image = cv2.cvtColor(image, conversion)
         # A new one for every frame: the library owns what it was given, and giving it twice frees it twice.
         frame = rs.software_video_frame()
         frame.pixels = image
@@ -225,11 +240,16 @@ class TwinDevice:
         self._sensor.on_video_frame(frame)
 
 
-def _checked(image: np.ndarray | None, shape: tuple[int, ...], dtype: type, name: str) -> np.ndarray:
+def _key(profile) -> tuple:
+    size = (profile.width(), profile.height())
+    return (profile.stream_type(), profile.stream_index(), profile.format(), *size, profile.fps())
+
+
+def _checked(image: np.ndarray, shape: tuple[int, ...], dtype: type, name: str) -> np.ndarray:
     """Return the image in one piece; the library copies its bytes without looking at shape, type or strides."""
-    if image is None or image.shape != shape or image.dtype != dtype:
-        seen = "none" if image is None else f"{image.dtype} {image.shape}"
-        raise ValueError(f"the frame source gave {seen} for {name}; wanted is {np.dtype(dtype).name} {shape}.")
+    if image.shape != shape or image.dtype != dtype:
+        seen, wanted = f"{image.dtype} {image.shape}", f"{np.dtype(dtype).name} {shape}"
+        raise ValueError(f"the frame source gave {seen} for {name}; wanted is {wanted}.")
     return np.ascontiguousarray(image)
 
 

@@ -1,0 +1,28 @@
+"""The digital twin in place of a device, for programs that were written for the device.
+
+    ./z1 twin run-script [options] FILE.py [its own arguments]    a script for pyrealsense2 sees the twin's D405
+
+`./z1 twin run-script --help` tells the options.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+
+from scripts import run_script
+
+_STEPS: dict[str, Callable[[list[str]], int]] = {"run-script": run_script.main}
+_BAD_USAGE = 2
+
+
+def main(arguments: list[str]) -> int:
+    """Do what the first argument names."""
+    name, *rest = arguments or [""]
+    if name in _STEPS:
+        return _STEPS[name](rest)
+    if name in ("-h", "--help"):
+        print(__doc__)
+        return 0
+    print(f"error: ./z1 twin takes one of: {', '.join(_STEPS)}; not {name!r}.", file=sys.stderr)
+    return _BAD_USAGE
