@@ -5,12 +5,28 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from calibration.board import Board
 from calibration.camera_model import CameraModel
 from calibration.detection import BoardView
-from calibration.errors import CalibrationWarning
+from calibration.errors import CalibrationError, CalibrationWarning
+from calibration.pose import check_corners
+
+MIN_VIEWS = 5
+"""Fewer views are refused."""
+GOOD_VIEWS = 10
+"""Fewer views get the warning `too_few_views`."""
+
+_CELLS = (6, 8)  # rows and columns of the coverage map
+_FOLDS = 5
+_OUTLIER = 3.0  # a view is refused when its error is this many times the median of the others, …
+_LEAST_OUTLIER_PX = 0.5  # … and at least this [px]
+_MIN_TILT_DEG, _GOOD_TILT_DEG = 5.0, 20.0
+_GOOD_COVERAGE = 0.7
+_GOOD_RMS_PX = 0.5
+_STEADY = 1e-12  # with less than this change the adjustment has settled
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -46,4 +62,127 @@ def calibrate_intrinsics(
         CalibrationError: `too_few_views`, `bad_view` (image sizes differ), `too_similar_poses` (all views parallel:
             focal length and distance cannot be told apart).
     """
-    raise NotImplementedError
+    names = tuple(str(i) for i in range(1, len(views) + 1)) if names is None else tuple(names)
+    _check_views(views, board, names)
+    kept, refused = list(range(len(views))), {}
+    while True:
+        camera, sd, errors, rotations = _fit([views[i] for i in kept], board)
+        _check_number(len(kept))
+        median = float(np.median(errors))
+        worst = int(np.argmax(errors))
+        if errors[worst] < max(_OUTLIER * median, _LEAST_OUTLIER_PX):
+            break
+        refused[names[kept[worst]]] = (
+            f"its corners are {errors[worst]:.2f} px off, those of the other views {median:.2f} px: "
+            "blurred, partly hidden, or a bent board"
+        )
+        del kept[worst]
+    tilts = _tilts_deg(rotations)
+    if tilts.max() < _MIN_TILT_DEG:
+        raise CalibrationError(
+            "too_similar_poses",
+            f"the board is tilted by {tilts.max():.1f}° at most: focal length and distance cannot be told apart; "
+            f"tilt it by {_GOOD_TILT_DEG:g}° to 45° in several directions.",
+        )
+    coverage = _coverage([views[i] for i in kept])
+    rms_px = float(np.sqrt(np.average(errors**2, weights=[len(views[i].ids) for i in kept])))
+    return IntrinsicsResult(
+        camera=camera,
+        sd=sd,
+        rms_px=rms_px,
+        holdout_px=_holdout_px([views[i] for i in kept], board),
+        view_names=names,
+        view_errors_px=np.array([_view_error_px(view, board, camera) for view in views]),
+        refused=refused,
+        coverage=coverage,
+        warnings=tuple(_warnings(len(kept), coverage, float(tilts.max()), rms_px)),
+    )
+
+
+def _check_views(views: Sequence[BoardView], board: Board, names: tuple[str, ...]) -> None:
+    _check_number(len(views))
+    if len(set(names)) != len(views):
+        raise CalibrationError("bad_view", f"{len(views)} views need as many different names; got {names}.")
+    for name, view in zip(names, views, strict=True):
+        if view.image_size != views[0].image_size:
+            raise CalibrationError(
+                "bad_view", f"view {name} is of {view.image_size} px, the first of {views[0].image_size} px."
+            )
+        check_corners(view, board)
+
+
+def _check_number(n: int) -> None:
+    if n < MIN_VIEWS:
+        raise CalibrationError(
+            "too_few_views",
+            f"{n} usable views; at least {MIN_VIEWS} are needed and {2 * GOOD_VIEWS} are good: take more.",
+        )
+
+
+def _fit(views: Sequence[BoardView], board: Board) -> tuple[CameraModel, np.ndarray, np.ndarray, np.ndarray]:
+    """Return the camera, its standard deviations (9,), the error of each view (V,) [px] and its rotation (V, 3, 3)."""
+    size = views[0].image_size
+    points = [np.float32(board.corners_m[view.ids]).reshape(-1, 1, 3) for view in views]
+    pixels = [np.float32(view.pixels_px).reshape(-1, 1, 2) for view in views]
+    criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 100, _STEADY)
+    try:
+        _, matrix, distortion, turns, _, sd, _, errors = cv2.calibrateCameraExtended(
+            points, pixels, size, np.eye(3), np.zeros(5), criteria=criteria
+        )
+    except cv2.error as error:
+        raise CalibrationError("too_similar_poses", f"no camera explains these views: {error.err}") from error
+    camera = CameraModel(matrix=matrix, distortion=np.ravel(distortion)[:5], size=size)
+    rotations = np.array([cv2.Rodrigues(turn)[0] for turn in turns])
+    return camera, np.ravel(sd)[:9], np.ravel(errors), rotations
+
+
+def _view_error_px(view: BoardView, board: Board, camera: CameraModel) -> float:
+    """Return the rms error of `view` at the pose that suits it best [px]."""
+    points, pixels = board.corners_m[view.ids], np.ascontiguousarray(view.pixels_px)
+    _, turn, position = cv2.solvePnP(points, pixels, camera.matrix, camera.distortion, flags=cv2.SOLVEPNP_IPPE)
+    turn, position = cv2.solvePnPRefineLM(points, pixels, camera.matrix, camera.distortion, turn, position)
+    seen = points @ cv2.Rodrigues(turn)[0].T + np.ravel(position)
+    return float(np.sqrt(np.mean(np.sum((camera.project(seen) - pixels) ** 2, axis=1))))
+
+
+def _holdout_px(views: Sequence[BoardView], board: Board) -> float:
+    squares, counts = 0.0, 0
+    for fold in range(_FOLDS):
+        camera = _fit([view for i, view in enumerate(views) if i % _FOLDS != fold], board)[0]
+        for view in views[fold::_FOLDS]:
+            squares += _view_error_px(view, board, camera) ** 2 * len(view.ids)
+            counts += len(view.ids)
+    return float(np.sqrt(squares / counts))
+
+
+def _tilts_deg(rotations: np.ndarray) -> np.ndarray:
+    """Return the angle of each board to the image plane (V,) [°]."""
+    return np.degrees(np.arccos(np.clip(np.abs(rotations[:, 2, 2]), 0.0, 1.0)))
+
+
+def _coverage(views: Sequence[BoardView]) -> np.ndarray:
+    width, height = views[0].image_size
+    pixels = np.vstack([view.pixels_px for view in views])
+    counts, _, _ = np.histogram2d(pixels[:, 1], pixels[:, 0], bins=_CELLS, range=((0, height), (0, width)))
+    return counts.astype(int)
+
+
+def _warnings(n: int, coverage: np.ndarray, tilt_deg: float, rms_px: float) -> list[CalibrationWarning]:
+    covered, rows, columns = float((coverage > 0).mean()), *_CELLS
+    told = {
+        "too_few_views": (n < GOOD_VIEWS, f"{n} usable views; {2 * GOOD_VIEWS} are good."),
+        "poor_coverage": (
+            covered < _GOOD_COVERAGE,
+            f"corners were seen in {100 * covered:.0f} % of the image ({rows} × {columns} cells): show the board in the "
+            "corners and at the edges too, where distortion is greatest.",
+        ),
+        "little_tilt": (
+            tilt_deg < _GOOD_TILT_DEG,
+            f"the board is tilted by {tilt_deg:.0f}° at most; {_GOOD_TILT_DEG:g}° to 45° pin down the focal length.",
+        ),
+        "high_error": (
+            rms_px > _GOOD_RMS_PX,
+            f"corners are {rms_px:.2f} px (rms) off, up to {_GOOD_RMS_PX} is good: is the board flat, the image sharp?",
+        ),
+    }
+    return [CalibrationWarning(code=code, message=message) for code, (holds, message) in told.items() if holds]

@@ -73,6 +73,15 @@ def check_view(view: BoardView, board: Board, camera: CameraModel) -> np.ndarray
         raise CalibrationError(
             "bad_view", f"an image of {view.image_size} px was given with a camera of {camera.size} px."
         )
+    return check_corners(view, board)
+
+
+def check_corners(view: BoardView, board: Board) -> np.ndarray:
+    """Return the corners (N, 3) of `view` in the board frame [m].
+
+    Raises:
+        CalibrationError: `bad_view`: too few corners, corners on one line, or ids the board does not have.
+    """
     corners = board.corners_m
     if len(view.ids) < MIN_CORNERS or view.ids.min() < 0 or view.ids.max() >= len(corners):
         raise CalibrationError(

@@ -142,8 +142,7 @@ def solve(
 
 
 def _step(e: np.ndarray, J: np.ndarray, W: np.ndarray, fit: Fit, free_scale: bool) -> tuple[np.ndarray, np.ndarray]:
-    H = np.einsum("nki,nkl,nlj->ij", J, W, J)
-    g = np.einsum("nki,nkl,nl->i", J, W, e)
+    H, g = _normal_equations(e, J, W)
     H[0, 0] += _SCALE_SD**-2
     g[0] += (fit.scale - 1.0) * _SCALE_SD**-2
     used = np.arange(0 if free_scale else 1, len(g))
@@ -151,6 +150,11 @@ def _step(e: np.ndarray, J: np.ndarray, W: np.ndarray, fit: Fit, free_scale: boo
     # a group of samples that all got the weight 0 leaves its board free: it stays where it is
     P[np.ix_(used, used)] = np.linalg.pinv(H[np.ix_(used, used)], rcond=1e-15, hermitian=True)
     return -P @ g, P
+
+
+def _normal_equations(e: np.ndarray, J: np.ndarray, W: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    weighed, rows = (W @ J).reshape(-1, J.shape[2]), J.reshape(-1, J.shape[2])
+    return rows.T @ weighed, weighed.T @ e.ravel()
 
 
 def squared_distances(e: np.ndarray, C: np.ndarray) -> np.ndarray:
@@ -171,8 +175,7 @@ def estimate_noise(data: PoseData, fit: Fit, kept: np.ndarray, start: NoiseLevel
         arm = np.repeat(np.exp(2.0 * log_scatter), 3)
         C = corner + (M * arm) @ np.swapaxes(M, 1, 2)
         W = np.linalg.inv(C)
-        H = np.einsum("nki,nkl,nlj->ij", J, W, J)
-        g = np.einsum("nki,nkl,nl->i", J, W, e)
+        H, g = _normal_equations(e, J, W)
         misfit = np.einsum("ni,nij,nj->", e, W, e) - g @ np.linalg.lstsq(H, g, rcond=None)[0]
         return float(misfit + np.linalg.slogdet(C)[1].sum() + np.linalg.slogdet(H)[1])
 

@@ -5,20 +5,29 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import json
+import logging
+import re
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 
 from calibration.board import Board
 from calibration.camera_model import CameraModel
-from calibration.errors import CalibrationWarning
+from calibration.errors import CalibrationError, CalibrationWarning
+from calibration.files import write_new
 from calibration.hand_eye_result import HandEyeResult, Setup
 from calibration.intrinsics import IntrinsicsResult
+from calibration.transforms import check_poses
+
+logger = logging.getLogger(__name__)
 
 Kind = Literal["hand_eye", "intrinsics"]
 
+FORMAT = 1
+"""Of the files; one that a newer version wrote is refused rather than guessed at."""
 MAX_UNCERTAINTY_MM = 1.0
 """A hand-eye result less certain than this is used with a warning."""
 MAX_UNCERTAINTY_DEG = 0.2
@@ -59,6 +68,19 @@ class Calibration:
     path: Path | None = None
     """The file it was read from."""
 
+    def __post_init__(self) -> None:
+        if self.kind not in get_args(Kind) or not self.serial or not self.date:
+            raise CalibrationError("bad_result", f"a {self.kind!r} of camera {self.serial!r}, dated {self.date!r}?")
+        if self.kind == "hand_eye":
+            if self.setup not in get_args(Setup) or self.T_mount_camera is None or self.T_anchor_board is None:
+                raise CalibrationError(
+                    "bad_result", f"a hand-eye result needs setup and poses; setup is {self.setup!r}."
+                )
+            check_poses(np.array([self.T_mount_camera, self.T_anchor_board]), "T_mount_camera, T_anchor_board")
+        numbers = [*self.errors.values(), *([] if self.covariance is None else np.ravel(self.covariance))]
+        if not np.isfinite(np.array(numbers, dtype=np.float64)).all():
+            raise CalibrationError("bad_result", f"errors {self.errors} or covariance are not finite.")
+
     @property
     def T_flange_camera(self) -> np.ndarray:
         """(4, 4) the camera on the flange.
@@ -66,26 +88,117 @@ class Calibration:
         Raises:
             CalibrationError: not a hand-eye result, or one of an eye to hand.
         """
-        raise NotImplementedError
+        return self._pose_of("eye_in_hand")
+
+    @property
+    def T_base_camera(self) -> np.ndarray:
+        """(4, 4) the camera in the base.
+
+        Raises:
+            CalibrationError: not a hand-eye result, or one of an eye in hand.
+        """
+        return self._pose_of("eye_to_hand")
+
+    def _pose_of(self, setup: Setup) -> np.ndarray:
+        if self.setup != setup or self.T_mount_camera is None:
+            what = self.kind if self.setup is None else self.setup
+            raise CalibrationError("wrong_setup", f"{self} is of {what}; an {setup} is needed.")
+        return self.T_mount_camera
+
+    def __str__(self) -> str:
+        figures = ", ".join(f"{name} {value:.3g}" for name, value in self.errors.items())
+        place = "" if self.path is None else f" in {self.path}"
+        return f"{self.kind} of camera {self.serial}, {self.date}{place} ({figures})"
+
+    def doubts(self) -> list[str]:
+        """Return what speaks against using this result: figures above the thresholds, and the solver's warnings."""
+        limits = {"uncertainty_mm": MAX_UNCERTAINTY_MM, "uncertainty_deg": MAX_UNCERTAINTY_DEG}
+        if self.kind == "intrinsics":
+            limits = {"rms_px": MAX_RMS_PX}
+        above = [
+            f"{name} is {self.errors[name]:.3g}, up to {limit:g} is good: calibrate again"
+            for name, limit in limits.items()
+            if self.errors.get(name, 0.0) > limit
+        ]
+        return above + [warning.message for warning in self.warnings]
 
     @classmethod
     def of_hand_eye(
         cls, result: HandEyeResult, *, serial: str, date: str, board: Board, camera: CameraModel, folder: str
     ) -> Calibration:
         """Return `result` with its origin; `folder` is where its samples are."""
-        raise NotImplementedError
+        names = ("uncertainty_mm", "uncertainty_deg", "rms_mm", "rms_deg", "holdout_mm", "holdout_deg", "diversity")
+        errors = {name: float(getattr(result, name)) for name in names}
+        if result.rms_px is not None:
+            errors["rms_px"] = result.rms_px
+        return cls(
+            kind="hand_eye",
+            serial=serial,
+            date=date,
+            board=board,
+            camera=camera,
+            samples=_origin(folder, result.sample_names, result.dropped),
+            errors=errors,
+            warnings=result.warnings,
+            setup=result.setup,
+            T_mount_camera=result.T_mount_camera,
+            T_anchor_board=result.T_anchor_board,
+            covariance=result.covariance,
+        )
 
     @classmethod
     def of_intrinsics(
         cls, result: IntrinsicsResult, *, serial: str, date: str, board: Board, folder: str
     ) -> Calibration:
         """Return `result` with its origin; `folder` is where its samples are."""
-        raise NotImplementedError
+        return cls(
+            kind="intrinsics",
+            serial=serial,
+            date=date,
+            board=board,
+            camera=result.camera,
+            samples=_origin(folder, result.view_names, result.refused),
+            errors={"rms_px": result.rms_px, "holdout_px": result.holdout_px},
+            warnings=result.warnings,
+        )
+
+
+def _origin(folder: str, names: tuple[str, ...], dropped: dict[str, str]) -> dict[str, Any]:
+    return {"folder": folder, "used": [name for name in names if name not in dropped], "dropped": dict(dropped)}
 
 
 def save_result(folder: Path, calibration: Calibration) -> Path:
     """Write the next version into `folder` and return its path; no file that exists is ever touched."""
-    raise NotImplementedError
+    folder.mkdir(parents=True, exist_ok=True)
+    arrays = ("T_mount_camera", "T_anchor_board", "covariance")
+    values = {
+        "format": FORMAT,
+        "kind": calibration.kind,
+        "serial": calibration.serial,
+        "date": calibration.date,
+        "board": calibration.board.to_dict(),
+        "camera": calibration.camera.to_dict(),
+        "samples": calibration.samples,
+        "errors": calibration.errors,
+        "warnings": [asdict(warning) for warning in calibration.warnings],
+        "setup": calibration.setup,
+    } | {name: None if (a := getattr(calibration, name)) is None else np.asarray(a).tolist() for name in arrays}
+    content = (json.dumps(values, indent=2, allow_nan=False) + "\n").encode()
+    stem = _stem(calibration.kind, calibration.serial)
+    version = 1 + max((_version(path, stem) for path in folder.iterdir()), default=0)
+    while not write_new(folder / f"{stem}_v{version:04d}.json", content):
+        version += 1  # another process took this number
+    return folder / f"{stem}_v{version:04d}.json"
+
+
+def _stem(kind: str, serial: str) -> str:
+    return f"{kind}_{re.sub(r'[^A-Za-z0-9.-]', '-', serial)}"
+
+
+def _version(path: Path, stem: str) -> int:
+    """Return the version in a file's name; 0 for another kind of file."""
+    match = re.fullmatch(re.escape(stem) + r"_v(\d+)\.json", path.name)
+    return int(match[1]) if match else 0
 
 
 def load_result(path: Path, *, serial: str | None = None) -> Calibration:
@@ -94,7 +207,47 @@ def load_result(path: Path, *, serial: str | None = None) -> Calibration:
     Raises:
         CalibrationError: `damaged_result`, `missing_result`, or `wrong_serial` (it is of another camera than `serial`).
     """
-    raise NotImplementedError
+    found = _read(path)
+    if serial is not None and found.serial != serial:
+        raise CalibrationError(
+            "wrong_serial",
+            f"{path} is of camera {found.serial}, and this one is {serial}: calibrate it, or give its own file.",
+        )
+    logger.info("calibration: %s", found)
+    for doubt in found.doubts():
+        logger.warning("calibration %s: %s", path.name, doubt)
+    return found
+
+
+def _read(path: Path) -> Calibration:
+    try:
+        values = json.loads(path.read_text())
+        if values["format"] != FORMAT:
+            raise ValueError(f"its format is {values['format']!r}, known is {FORMAT}")
+        arrays = {
+            name: None if values[name] is None else np.array(values[name], dtype=np.float64)
+            for name in ("T_mount_camera", "T_anchor_board", "covariance")
+        }
+        return Calibration(
+            kind=values["kind"],
+            serial=values["serial"],
+            date=values["date"],
+            board=Board.from_dict(values["board"]),
+            camera=CameraModel.from_dict(values["camera"]),
+            samples=values["samples"],
+            errors={name: float(value) for name, value in values["errors"].items()},
+            warnings=tuple(
+                CalibrationWarning(code=w["code"], message=w["message"], samples=tuple(w["samples"]))
+                for w in values["warnings"]
+            ),
+            setup=values["setup"],
+            path=path,
+            **arrays,
+        )
+    except FileNotFoundError as error:
+        raise CalibrationError("missing_result", f"there is no calibration {path}.") from error
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise CalibrationError("damaged_result", f"{path} is no calibration result: {error!r}.") from error
 
 
 def load_newest(folder: Path, kind: Kind, serial: str) -> Calibration:
@@ -103,4 +256,15 @@ def load_newest(folder: Path, kind: Kind, serial: str) -> Calibration:
     Raises:
         CalibrationError: `missing_result` (none of this camera; those of others are listed).
     """
-    raise NotImplementedError
+    files = sorted(folder.iterdir()) if folder.is_dir() else []
+    stem = _stem(kind, serial)
+    for path in sorted((p for p in files if _version(p, stem)), key=lambda p: -_version(p, stem)):
+        try:
+            return load_result(path, serial=serial)
+        except CalibrationError as error:
+            logger.warning("calibration skipped: %s", error)
+    others = ", ".join(p.name for p in files if p.suffix == ".json") or "nothing"
+    raise CalibrationError(
+        "missing_result",
+        f"{folder} holds no valid {kind} calibration of camera {serial}, but {others}; run `./z1 calibrate`.",
+    )

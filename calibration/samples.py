@@ -6,16 +6,25 @@ tells the picture's checksum, so a sample is whole when its JSON is.
 
 from __future__ import annotations
 
+import hashlib
+import io
+import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image
 
 from calibration.board import Board
 from calibration.camera_model import CameraModel
-from calibration.errors import CalibrationWarning
+from calibration.errors import CalibrationError, CalibrationWarning
+from calibration.files import write_new
 from calibration.hand_eye_result import Setup
+from calibration.transforms import check_poses
+
+FORMAT = 1
+"""Of the files; one that a newer version wrote is refused rather than guessed at."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -70,7 +79,51 @@ def open_session(folder: Path, session: Session) -> None:
     Raises:
         CalibrationError: it holds another session.
     """
-    raise NotImplementedError
+    folder.mkdir(parents=True, exist_ok=True)
+    values = {
+        "format": FORMAT,
+        "board": session.board.to_dict(),
+        "serial": session.serial,
+        "setup": session.setup,
+        "camera": session.camera.to_dict(),
+        "date": session.date,
+        "truth": session.truth,
+    }
+    if write_new(folder / "session.json", _json(values)):
+        return
+    there = load_session(folder)
+    ours = (session.board, session.serial, session.setup, session.camera.to_dict())
+    if (there.board, there.serial, there.setup, there.camera.to_dict()) != ours:
+        raise CalibrationError(
+            "other_session",
+            f"{folder} holds a session of camera {there.serial}, {there.setup}, {there.board}, begun {there.date}; "
+            "give another folder.",
+        )
+
+
+def load_session(folder: Path) -> Session:
+    """Return what all samples of `folder` have in common.
+
+    Raises:
+        CalibrationError: `no_session`.
+    """
+    path = folder / "session.json"
+    try:
+        values = json.loads(path.read_text())
+        if values["format"] != FORMAT:
+            raise ValueError(f"its format is {values['format']!r}, known is {FORMAT}")
+        return Session(
+            board=Board.from_dict(values["board"]),
+            serial=str(values["serial"]),
+            setup=values["setup"],
+            camera=CameraModel.from_dict(values["camera"]),
+            date=str(values["date"]),
+            truth=values["truth"],
+        )
+    except FileNotFoundError as error:
+        raise CalibrationError("no_session", f"{folder} holds no calibration session (no session.json).") from error
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise CalibrationError("no_session", f"{path} cannot be read: {error!r}.") from error
 
 
 def save_sample(folder: Path, sample: Sample) -> str:
@@ -79,7 +132,22 @@ def save_sample(folder: Path, sample: Sample) -> str:
     Raises:
         CalibrationError: no session in `folder`, or a sample that is not one (shapes, values).
     """
-    raise NotImplementedError
+    session = load_session(folder)
+    _check_sample(sample, session)
+    picture = io.BytesIO()
+    Image.fromarray(sample.image).save(picture, format="PNG")
+    number = 1 + max((int(path.stem) for path in folder.iterdir() if path.stem.isdigit()), default=0)
+    while not write_new(folder / f"{number:04d}.png", picture.getvalue()):
+        number += 1  # another process took this number
+    values = {
+        "format": FORMAT,
+        "image_sha256": hashlib.sha256(picture.getvalue()).hexdigest(),
+        "T_base_flange": sample.T_base_flange.tolist(),
+        "q": sample.q.tolist(),
+        "stamp_s": float(sample.stamp_s),
+    }
+    write_new(folder / f"{number:04d}.json", _json(values))
+    return f"{number:04d}"
 
 
 def load_samples(folder: Path) -> LoadedSamples:
@@ -88,4 +156,49 @@ def load_samples(folder: Path) -> LoadedSamples:
     Raises:
         CalibrationError: no session, or one that cannot be read.
     """
-    raise NotImplementedError
+    session = load_session(folder)
+    names, samples, warnings = [], [], []
+    for name in sorted({path.stem for path in folder.iterdir() if path.stem.isdigit()}, key=int):
+        try:
+            samples.append(_load_sample(folder, name, session))
+            names.append(name)
+        except (OSError, ValueError, KeyError, TypeError, SyntaxError) as error:  # Pillow: SyntaxError for a broken PNG
+            message = f"sample {name} of {folder} cannot be used and was left out: {error}"
+            warnings.append(CalibrationWarning(code="damaged_sample", message=message, samples=(name,)))
+    return LoadedSamples(session=session, names=tuple(names), samples=tuple(samples), warnings=tuple(warnings))
+
+
+def _load_sample(folder: Path, name: str, session: Session) -> Sample:
+    values = json.loads((folder / f"{name}.json").read_text())
+    if values["format"] != FORMAT:
+        raise ValueError(f"its format is {values['format']!r}, known is {FORMAT}.")
+    picture = (folder / f"{name}.png").read_bytes()
+    if hashlib.sha256(picture).hexdigest() != values["image_sha256"]:
+        raise ValueError("its picture is not the one that was taken (checksum).")
+    with Image.open(io.BytesIO(picture)) as image:
+        pixels = np.asarray(image)
+    sample = Sample(
+        image=pixels,
+        T_base_flange=np.array(values["T_base_flange"], dtype=np.float64),
+        q=np.array(values["q"], dtype=np.float64),
+        stamp_s=float(values["stamp_s"]),
+    )
+    _check_sample(sample, session)
+    return sample
+
+
+def _check_sample(sample: Sample, session: Session) -> None:
+    width, height = session.camera.size
+    if sample.image.dtype != np.uint8 or sample.image.shape not in ((height, width, 3), (height, width)):
+        raise CalibrationError(
+            "bad_sample",
+            f"an image of {sample.image.shape} {sample.image.dtype} is not of this session's camera: "
+            f"({height}, {width}, 3) or ({height}, {width}) of uint8.",
+        )
+    check_poses(np.asarray(sample.T_base_flange)[None], "T_base_flange")
+    if sample.q.ndim != 1 or not np.isfinite(sample.q).all() or not np.isfinite(sample.stamp_s):
+        raise CalibrationError("bad_sample", f"joints {sample.q} or stamp {sample.stamp_s} are not finite numbers.")
+
+
+def _json(values: dict[str, Any]) -> bytes:
+    return (json.dumps(values, indent=2, allow_nan=False) + "\n").encode()
