@@ -49,15 +49,13 @@ def find_mount(serial: str, file: Path | None = None, folder: Path | None = None
         ConfigError: `file` is missing or damaged, of another camera, or no hand-eye result of a wrist camera.
     """
     folder = results_folder(folder)
-    if file is None and not folder.is_dir():
-        return _nominal(serial, folder)
     try:
         found = load_result(file, serial=serial) if file is not None else load_newest(folder, "hand_eye", serial)
         T_flange_camera = found.T_flange_camera
     except CalibrationError as error:
         if file is None and error.code == "missing_result":
             return _nominal(serial, folder)
-        raise ConfigError(f"{error} Calibrate with `./z1 calibrate hand-eye`.") from error
+        raise ConfigError(str(error)) from error
     return Mount(T_flange_camera=T_flange_camera, origin=_origin(found))
 
 
