@@ -51,6 +51,7 @@ ARMS: Registry[Arm] = Registry(
     {
         "mock": "hal.backends.mock_arm:MockArm",
         "sim": "sim_twin.backends:TwinArm",
+        "z1": "hal.backends.z1_arm:Z1Arm",
     },
 )
 CAMERAS: Registry[Camera] = Registry(

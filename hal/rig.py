@@ -30,6 +30,7 @@ RIGS: Registry[Rig] = Registry(
     "rig",
     {
         "mock": "hal.backends.mock_arm:make_rig",
+        "real": "hal.backends.real_rig:make_rig",
         "sim": "sim_twin.backends:make_rig",
     },
 )

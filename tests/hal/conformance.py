@@ -14,6 +14,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from z1_peer import FakeController, MemoryLink
 
 from hal.arm import Arm
 from hal.backends.d405_session import D405CameraConfig
@@ -60,6 +61,9 @@ def make_backend(registry: Any, name: str) -> tuple[Any, Clock]:
     if name in ("mock", "replay"):
         clock = ManualClock(10.0)
         return registry.make(name, clock=clock), clock
+    if name == "z1":
+        clock = ManualClock(10.0)
+        return registry.make(name, clock=clock, link=MemoryLink(FakeController(clock), clock)), clock
     device = registry.make(name)
     return device, device.clock
 
