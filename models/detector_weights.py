@@ -20,7 +20,8 @@ CLASSES = ("bottle", "cylinder", "box")
 ARCHITECTURE = "yolov8n-seg"
 INPUT_HW = (480, 640)
 """(H, W) of the images it is made for [px]: the D405's."""
-_MAKER = "python -m scripts.train_detector"
+MAKER = "python -m scripts.train_detector"
+"""The command that makes the weights."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -80,7 +81,7 @@ def load_detector(path: Path) -> LoadedDetector:
     Raises:
         WeightsError: the file or its checksum is missing, they do not agree, or the file is of another network.
     """
-    arrays = read_arrays(path, _MAKER)
+    arrays = read_arrays(path, MAKER)
     if lacking := [key for key in ("architecture", "names", "input_hw") if key not in arrays]:
         raise WeightsError(f"{path.name} is no detector: it lacks {', '.join(lacking)}.")
     if (architecture := str(arrays["architecture"])) != ARCHITECTURE:
@@ -92,15 +93,16 @@ def load_detector(path: Path) -> LoadedDetector:
 
 def new_network(n_classes: int) -> nn.Module:
     """Return an untrained YOLOv8n-seg for `n_classes`, in evaluation mode."""
-    forbid_downloads()
+    tame_ultralytics()
     from ultralytics.nn.tasks import SegmentationModel
 
     return SegmentationModel(f"{ARCHITECTURE}.yaml", ch=3, nc=n_classes, verbose=False).eval()
 
 
-def forbid_downloads() -> None:
-    """Keep ultralytics, which is imported after this, from installing packages and asking its servers."""
+def tame_ultralytics() -> None:
+    """Keep ultralytics, which is imported after this, from installing packages, asking its servers, and talking."""
     os.environ.setdefault("YOLO_AUTOINSTALL", "false")
+    os.environ.setdefault("YOLO_VERBOSE", "false")
     os.environ.setdefault("YOLO_OFFLINE", "true")
 
 

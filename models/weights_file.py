@@ -44,6 +44,20 @@ def read_arrays(path: Path, maker: str) -> dict[str, np.ndarray]:
     Raises:
         WeightsError: the file or its checksum is missing, they do not agree, or the file holds no plain arrays.
     """
+    checked_sha256(path, maker)
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return {key: file[key] for key in file.files}
+    except (ValueError, OSError, AttributeError, zipfile.BadZipFile) as err:
+        raise WeightsError(f"{path.name} holds no plain NumPy arrays ({err}); make it anew with `{maker}`.") from err
+
+
+def checked_sha256(path: Path, maker: str) -> str:
+    """Return the SHA-256 of the file at `path`, if it is the one beside it; `maker` is the command that makes both.
+
+    Raises:
+        WeightsError: the file or its checksum is missing, or they do not agree.
+    """
     checksum = path.with_suffix(".sha256")
     for needed in (path, checksum):
         if not needed.is_file():
@@ -54,11 +68,7 @@ def read_arrays(path: Path, maker: str) -> dict[str, np.ndarray]:
             f"{path.name} has SHA-256 {seen[:12]}…, {checksum.name} says {wanted[:12]}…: the file is damaged or was "
             "exchanged; restore both from the repository."
         )
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            return {key: file[key] for key in file.files}
-    except (ValueError, OSError, AttributeError, zipfile.BadZipFile) as err:
-        raise WeightsError(f"{path.name} holds no plain NumPy arrays ({err}); make it anew with `{maker}`.") from err
+    return seen
 
 
 def sha256_of(path: Path) -> str:

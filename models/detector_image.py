@@ -1,0 +1,141 @@
+"""What a YOLOv8 wants to be shown, and what its numbers say: the same arithmetic for every runtime.
+
+Follows ultralytics' predict(): letterbox with grey 114, RGB, 1/255; non-maximum suppression within each class; masks
+are sums of prototypes, scaled up, cut at zero and at the box.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from models.types import Detection
+
+_GREY = 114
+_MAX_CANDIDATES = 1000
+"""Boxes that enter the suppression; a trained network has some dozens above its threshold."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Letterbox:
+    """How an image was fitted into the network's input."""
+
+    image_hw: tuple[int, int]
+    """(H, W) of the image [px]."""
+    input_hw: tuple[int, int]
+    """(H, W) of the network's input [px]."""
+    inner_hw: tuple[int, int]
+    """(H, W) of the scaled image within it [px]."""
+    top_left: tuple[int, int]
+    """Rows above and columns left of it [px]."""
+
+    @classmethod
+    def fit(cls, image_hw: tuple[int, int], input_hw: tuple[int, int]) -> Letterbox:
+        """Return the largest image of the same proportions, in the middle of the input."""
+        gain = min(input_hw[0] / image_hw[0], input_hw[1] / image_hw[1])
+        inner = (max(round(image_hw[0] * gain), 1), max(round(image_hw[1] * gain), 1))
+        top, left = (round((whole - part) / 2 - 0.1) for whole, part in zip(input_hw, inner, strict=True))
+        return cls(image_hw=image_hw, input_hw=input_hw, inner_hw=inner, top_left=(top, left))
+
+    def blob(self, image: np.ndarray) -> np.ndarray:
+        """Return `image` (H, W, 3) uint8 RGB as the network's input (1, 3, H, W) float32 in [0, 1]."""
+        if self.inner_hw != self.image_hw:
+            image = cv2.resize(image, self.inner_hw[::-1], interpolation=cv2.INTER_LINEAR)
+        if self.inner_hw != self.input_hw:
+            (top, left), (height, width) = self.top_left, self.inner_hw
+            bottom, right = self.input_hw[0] - top - height, self.input_hw[1] - left - width
+            image = cv2.copyMakeBorder(image, top, bottom, left, right, cv2.BORDER_CONSTANT, value=(_GREY,) * 3)
+        return cv2.dnn.blobFromImage(image, 1.0 / 255.0)
+
+    def to_image(self, boxes: np.ndarray) -> np.ndarray:
+        """Return `boxes` (N, 4) of the input as boxes of the image, cut at its border [px]."""
+        top, left = self.top_left
+        height, width = self.image_hw
+        gain_v, gain_u = self.inner_hw[0] / height, self.inner_hw[1] / width  # not quite equal: both were rounded
+        boxes = (boxes - [left, top, left, top]) / [gain_u, gain_v, gain_u, gain_v]
+        return np.clip(boxes, 0, [width, height, width, height])
+
+    def mask(self, logits: np.ndarray) -> np.ndarray:
+        """Return where `logits` of a mask (h, w), over the whole input, are positive: (H, W) bool over the image."""
+        if self.input_hw != self.image_hw:
+            (top, left), (height, width) = self.top_left, self.inner_hw
+            logits = cv2.resize(logits, self.input_hw[::-1], interpolation=cv2.INTER_LINEAR)
+            logits = logits[top : top + height, left : left + width]
+        return cv2.resize(logits, self.image_hw[::-1], interpolation=cv2.INTER_LINEAR) > 0.0
+
+
+def read_outputs(
+    rows: np.ndarray,
+    prototypes: np.ndarray | None,
+    names: tuple[str, ...],
+    letterbox: Letterbox,
+    *,
+    min_confidence: float,
+    max_iou: float,
+    max_detections: int,
+) -> list[Detection]:
+    """Return what the network's outputs say, most confident first.
+
+    Args:
+        rows: (4 + C + M, A) one column an anchor: centre and size of its box in the input [px], C confidences, M
+            weights of the prototypes.
+        prototypes: (M, h, w) of the masks; None from a network without.
+        names: the C classes.
+        letterbox: how the image was fitted into the input.
+        min_confidence: what is not above this is dropped.
+        max_iou: of two boxes of a class that overlap more than this, the less confident is dropped.
+        max_detections: at most so many are returned.
+    """
+    kept = _suppressed(rows, len(names), min_confidence, max_iou)[:max_detections]
+    boxes = letterbox.to_image(_corners(rows[:4, kept].T))
+    found = []
+    for anchor, box in zip(kept, boxes, strict=True):
+        mask = None
+        if prototypes is not None:
+            weights = rows[4 + len(names) :, anchor]
+            mask = _cut(letterbox.mask(np.tensordot(weights, prototypes, axes=1).astype(np.float32)), box)
+        edges = _whole_pixels(box)
+        if edges[0] >= edges[2] or edges[1] >= edges[3] or (mask is not None and not mask.any()):
+            continue  # outside of the image, or nothing of it to be seen
+        scores = rows[4 : 4 + len(names), anchor]
+        label, confidence = names[int(scores.argmax())], float(scores.max())
+        found.append(Detection(label=label, confidence=confidence, box_px=edges, mask=mask))
+    return found
+
+
+def _suppressed(rows: np.ndarray, n_classes: int, min_confidence: float, max_iou: float) -> np.ndarray:
+    """Return the anchors that survive within their class, most confident first."""
+    scores = rows[4 : 4 + n_classes]
+    best = scores.max(axis=0)
+    candidates = np.flatnonzero(best > min_confidence)
+    candidates = candidates[np.argsort(-best[candidates], kind="stable")][:_MAX_CANDIDATES]
+    if not len(candidates):
+        return candidates
+    corners = _corners(rows[:4, candidates].T)
+    boxes = np.concatenate([corners[:, :2], corners[:, 2:] - corners[:, :2]], axis=1)
+    classes = scores[:, candidates].argmax(axis=0)
+    kept = cv2.dnn.NMSBoxesBatched(boxes.tolist(), best[candidates].tolist(), classes.tolist(), min_confidence, max_iou)
+    return candidates[np.sort(np.asarray(kept, dtype=int).reshape(-1))]
+
+
+def _corners(boxes: np.ndarray) -> np.ndarray:
+    """Return (N, 4) boxes given by centre and size as (u_min, v_min, u_max, v_max)."""
+    boxes = boxes.astype(float)
+    return np.concatenate([boxes[:, :2] - boxes[:, 2:] / 2, boxes[:, :2] + boxes[:, 2:] / 2], axis=1)
+
+
+def _cut(mask: np.ndarray, box: np.ndarray) -> np.ndarray:
+    """Return `mask` (H, W) without what lies outside `box` (u_min, v_min, u_max, v_max)."""
+    u_min, v_min, u_max, v_max = (int(edge) for edge in np.ceil(box))
+    cut = np.zeros_like(mask)
+    cut[v_min:v_max, u_min:u_max] = mask[v_min:v_max, u_min:u_max]
+    return cut
+
+
+def _whole_pixels(box: np.ndarray) -> tuple[int, int, int, int]:
+    """Return `box` grown to whole pixels, upper ends exclusive."""
+    u_min, v_min = np.floor(box[:2]).astype(int)
+    u_max, v_max = np.ceil(box[2:]).astype(int)
+    return int(u_min), int(v_min), int(u_max), int(v_max)
