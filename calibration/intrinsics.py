@@ -67,7 +67,6 @@ def calibrate_intrinsics(
     kept, refused = list(range(len(views))), {}
     while True:
         camera, sd, errors, rotations = _fit([views[i] for i in kept], board)
-        _check_number(len(kept))
         median = float(np.median(errors))
         worst = int(np.argmax(errors))
         if errors[worst] < max(_OUTLIER * median, _LEAST_OUTLIER_PX):
@@ -77,6 +76,7 @@ def calibrate_intrinsics(
             "blurred, partly hidden, or a bent board"
         )
         del kept[worst]
+        _check_number(len(kept))
     tilts = _tilts_deg(rotations)
     if tilts.max() < _MIN_TILT_DEG:
         raise CalibrationError(
@@ -173,8 +173,8 @@ def _warnings(n: int, coverage: np.ndarray, tilt_deg: float, rms_px: float) -> l
         "too_few_views": (n < GOOD_VIEWS, f"{n} usable views; {2 * GOOD_VIEWS} are good."),
         "poor_coverage": (
             covered < _GOOD_COVERAGE,
-            f"corners were seen in {100 * covered:.0f} % of the image ({rows} × {columns} cells): show the board in the "
-            "corners and at the edges too, where distortion is greatest.",
+            f"corners were seen in {100 * covered:.0f} % of the image ({rows} × {columns} cells): show the board in "
+            "the corners and at the edges too, where distortion is greatest.",
         ),
         "little_tilt": (
             tilt_deg < _GOOD_TILT_DEG,
