@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from models.adapters.errors import GeneratorError
+from models.torch_threads import single_threaded_workers
 from models.types import GraspGenerator, GraspSet, check_object_cloud
 
 T_NVIDIA_GRASP = np.array([[0.0, 1.0, 0.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
@@ -36,7 +36,8 @@ class NvidiaSampler:
         self._T_base_grasp = T_base_tip @ T_NVIDIA_GRASP
         self._source = source
         self._max_points = max_points
-        self._lock = threading.Lock()  # they keep the count of grasps in the network, and draw from global numbers
+        # One worker: they keep the count of grasps in the network, and draw from the process's global numbers.
+        self._worker = single_threaded_workers(1, source)
 
     def sample(self, points: np.ndarray, n: int, seed: int) -> GraspSet:
         """Return `n` grasps for `points` (M, 3) [m], best score first; widths are NaN.
@@ -45,20 +46,12 @@ class NvidiaSampler:
             ValueError: fewer than 30 points, points not finite, all in one place, or not in metres.
             GeneratorError: the network gave something else than n numbers.
         """
-        import torch
-
-        from models.adapters.torch_patches import cuda_only_if_there, drawn_from
-
         points = check_object_cloud(points, n)
         kept = points[np.random.default_rng(seed).permutation(len(points))[: self._max_points]]
         center = kept.mean(axis=0)
-        with self._lock, cuda_only_if_there(), drawn_from(seed):
-            cloud = torch.from_numpy((kept - center).astype(np.float32)).cuda()
-            # Their removal of outliers compares all pairs and keeps nothing of a sparse cloud: ours has been done.
-            T, scores, _ = self._sampler.sample(cloud, threshold=-1.0, num_grasps=n, remove_outliers=False)
-        if len(T) != n or not np.isfinite(T.cpu().numpy()).all():
+        T, scores = self._worker.submit(self._run, kept - center, n, seed).result()
+        if len(T) != n or not (np.isfinite(T).all() and np.isfinite(scores).all()):
             raise GeneratorError(f"{self._source} gave {len(T)} grasps of {n} with numbers; is the checkpoint whole?")
-        T, scores = T.double().cpu().numpy(), scores.double().cpu().numpy()
         T[:, :3, 3] += center
         T[:, 3] = [0.0, 0.0, 0.0, 1.0]
         order = np.argsort(-scores, kind="stable")
@@ -68,6 +61,18 @@ class NvidiaSampler:
             widths_m=np.full(n, np.nan),
             source=self._source,
         )
+
+    def _run(self, points: np.ndarray, n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return their poses (N, 4, 4) and scores (N,) for `points` (M, 3) about the origin, in their order."""
+        import torch
+
+        from models.adapters.torch_patches import cuda_only_if_there, drawn_from
+
+        with cuda_only_if_there(), drawn_from(seed):
+            cloud = torch.from_numpy(points.astype(np.float32)).cuda()
+            # Their removal of outliers compares all pairs and keeps nothing of a sparse cloud: ours has been done.
+            T, scores, _ = self._sampler.sample(cloud, threshold=-1.0, num_grasps=n, remove_outliers=False)
+        return T.double().cpu().numpy(), scores.double().cpu().numpy()
 
 
 def make_nvidia_generator(
