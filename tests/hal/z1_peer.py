@@ -69,6 +69,8 @@ class FakeController:
         """It gives no answers while this is set."""
         self.stuck: int | None = None
         """A joint that does not move, whatever is commanded."""
+        self.rests = False
+        """It lies on something that carries it in PASSIVE."""
         self.load = np.zeros(z1.N_JOINTS)
         """(7,) what pulls at the joints beside gravity [Nm]."""
         self.noise_rad = 0.0
@@ -150,7 +152,9 @@ class FakeController:
     def _step(self, dt_s: float) -> None:
         before = self.q.copy()
         gravity = gravity_model().torque(self.q, np.zeros(z1.N_JOINTS)) + self.load
-        if self.fsm in (Fsm.PASSIVE, Fsm.LOWCMD):
+        if self.fsm is Fsm.PASSIVE and self.rests:
+            self.tau = np.zeros(z1.N_JOINTS)
+        elif self.fsm in (Fsm.PASSIVE, Fsm.LOWCMD):
             self._push(gravity, dt_s)
         else:
             self._follow(dt_s)
