@@ -56,6 +56,11 @@ def test_nothing_nearer_than_min_z_is_measured() -> None:
     assert (measure_depth(_wall(MIN_Z_M + 0.005), seed=0, sequence=1) > 0).mean() > 0.5
 
 
+def test_a_resolution_with_another_min_z_measures_nearer() -> None:
+    assert (measure_depth(_wall(0.05), seed=0, sequence=1, min_z_m=0.04) > 0).mean() > 0.5
+    assert (round_depth(_wall(0.05), min_z_m=0.04) > 0).all()
+
+
 def test_the_band_that_only_the_left_imager_sees_is_empty() -> None:
     depth = measure_depth(_wall(0.2), seed=0, sequence=1)
     band = int(INTRINSICS.fx * BASELINE_M / 0.2)

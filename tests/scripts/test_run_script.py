@@ -1,0 +1,112 @@
+"""Scripts written for pyrealsense2, in the idiom of librealsense's own examples, run unmodified on the twin."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from hal.clock import ManualClock
+from scripts.script_windows import Windows, windows_as_files
+
+SCRIPTS = Path(__file__).parent / "realsense_scripts"
+needs_librealsense = pytest.mark.skipif(find_spec("pyrealsense2") is None, reason="pyrealsense2 has no wheel here")
+
+
+def run_script(tmp_path: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-P", "-m", "scripts.cli", "twin", "run-script", f"--windows={tmp_path}", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+@needs_librealsense
+def test_a_script_reads_distances_from_the_twin(tmp_path: Path) -> None:
+    done = run_script(tmp_path, "--lockstep", "--distance-m=0.45", str(SCRIPTS / "distance.py"))
+    assert done.returncode == 0, done.stderr
+    lines = done.stdout.splitlines()
+    distances = [float(line.split()[1]) for line in lines[:10]]
+    assert 0.2 < np.median(distances) < 0.35
+    assert len(set(distances)) > 1  # noise
+    assert lines[10] == "." * 32  # the far wall
+    assert "#" in lines[16]
+
+
+@needs_librealsense
+def test_a_viewer_with_options_of_its_own_shows_its_window_in_a_file(tmp_path: Path) -> None:
+    viewer = str(SCRIPTS / "aligned_viewer.py")
+    done = run_script(tmp_path, "--lockstep", "--frames=2", viewer, "--clip", "0.7")
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines() == [
+        "Intel RealSense D405 000000000405",
+        "usb 3.2",
+        "product line D400",
+        "depth scale 0.000100",
+        "there and back True True",
+    ]
+    picture = cv2.imread(str(tmp_path / "Aligned.png"))
+    assert picture is not None
+    assert picture.shape == (480, 1280, 3)
+    assert picture[:100, :600].min() == picture[:100, :600].max() == 153  # the background is gone
+    assert f"its window is in {tmp_path / 'Aligned.png'}" in done.stderr
+
+
+@needs_librealsense
+def test_a_script_filters_records_and_replays(tmp_path: Path) -> None:
+    recording, cloud = tmp_path / "second.db3", tmp_path / "cloud.ply"
+    script = str(SCRIPTS / "record_and_replay.py")
+    done = run_script(tmp_path, "--lockstep", script, str(recording), str(cloud))
+    assert done.returncode == 0, done.stderr
+    seen = done.stdout.splitlines()
+    assert seen[:2] == ["filtered (120, 212)", "colorized (240, 424, 3)"]
+    assert seen[2].startswith("vertices 101760 0.")
+    assert seen[3:] == ["played from Intel RealSense D405", "played True"]
+    assert recording.stat().st_size > 1e6
+    assert cloud.read_bytes().startswith(b"ply")
+
+
+@needs_librealsense
+def test_a_script_that_ends_with_a_code_or_an_error_ends_so_here(tmp_path: Path) -> None:
+    script = tmp_path / "ends.py"
+    script.write_text("import sys\nif sys.argv[1:] == ['word']: sys.exit('gone')\nsys.exit(int(sys.argv[1]))\n")
+    assert run_script(tmp_path, str(script), "7").returncode == 7
+    done = run_script(tmp_path, str(script), "word")
+    assert (done.returncode, done.stderr.splitlines()[-1]) == (1, "gone")
+
+
+def test_a_script_that_is_not_there_and_a_step_that_is_unknown_are_bad_usage(tmp_path: Path) -> None:
+    done = run_script(tmp_path, "nowhere.py")
+    assert (done.returncode, done.stderr) == (2, "error: there is no script nowhere.py.\n")
+    command = [sys.executable, "-P", "-m", "scripts.cli", "twin", "run-scrip"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert "run-script; not 'run-scrip'" in done.stderr
+
+
+def test_windows_keep_their_last_picture_and_press_keys_in_the_end(tmp_path: Path) -> None:
+    clock = ManualClock()
+    windows = Windows(clock, frames=2)
+    windows.show("Depth / raw", np.full((4, 6), 0.5))
+    assert windows.wait_key(20) == -1
+    assert clock.now_s() == pytest.approx(0.02)
+    windows.show("Depth / raw", np.full((4, 6), 1.0))
+    assert [windows.wait_key(1) for _ in range(3)] == [27, ord("q"), 27]
+    (file,) = windows.save(tmp_path / "new")
+    assert file.name == "Depth_raw.png"
+    picture = cv2.imread(str(file))
+    assert picture is not None
+    assert (picture == 255).all()
+
+
+def test_opencv_gets_its_own_functions_back(tmp_path: Path) -> None:
+    before = cv2.waitKey
+    with windows_as_files(tmp_path, ManualClock(), 1) as windows:
+        if windows is None:
+            pytest.skip("this OpenCV has windows of its own")
+        cv2.imshow("x", np.zeros((2, 2, 3), np.uint8))
+        assert cv2.waitKey(1) == 27
+    assert cv2.waitKey is before
+    assert (tmp_path / "x.png").is_file()
