@@ -125,7 +125,7 @@ def _best_split(data: PoseData, fit: Fit, noise: NoiseLevels) -> tuple[float, Fi
         place = (np.arange(len(data)) >= first).astype(int)
         boards = data.Ts_anchor_mount @ fit.T_mount_camera @ data.Ts_camera_board
         places = np.stack([_middle(boards[place == g]) for g in range(2)])
-        two, d2 = robust_solve(data, replace(fit, Ts_anchor_board=places, place=place), noise)
+        two, d2 = robust_solve(data, replace(fit, Ts_anchor_board=places, place=place), noise, rounds=5)
         near = d2 < _FAR
         if min(near[:first].sum(), near[first:].sum()) < _LEAST_GROUP:
             continue
