@@ -1,0 +1,167 @@
+"""The detector's pictures: what the labels say is what the picture shows."""
+
+from collections.abc import Iterator
+
+import mujoco
+import numpy as np
+import pytest
+from gl_here import needs_egl
+
+from hal import z1
+from sim_twin.d405 import INTRINSICS
+from sim_twin.detection_props import CLASSES, make_class_prop, make_distractor, nominal_prop
+from sim_twin.detection_scenes import (
+    LEAST_PIXELS,
+    LEAST_SHARE,
+    SceneMix,
+    draw_scenario,
+    draw_scene,
+    outline_area,
+)
+from sim_twin.detection_stage import Stage
+from sim_twin.objects import OBJECTS
+from sim_twin.photo import spoil_photo
+from sim_twin.render import make_renderer
+from sim_twin.scene import SceneConfig
+from sim_twin.textures import random_texture
+from sim_twin.world import World
+
+HOME = np.append(z1.Q_HOME, -1.0)
+
+
+@pytest.fixture(scope="module")
+def stage() -> Iterator[Stage]:
+    made = Stage(7)
+    yield made
+    made.close()
+
+
+@needs_egl
+def test_the_same_seed_gives_the_same_picture_and_another_seed_another(stage: Stage) -> None:
+    first, again, other = (draw_scene(stage, np.random.default_rng(seed)) for seed in (3, 3, 4))
+    assert np.array_equal(first.colour, again.colour)
+    assert [label.name for label in first.labels] == [label.name for label in again.labels]
+    assert all(np.array_equal(a.mask, b.mask) for a, b in zip(first.labels, again.labels, strict=True))
+    assert not np.array_equal(first.colour, other.colour)
+
+
+@needs_egl
+def test_labels_are_of_the_three_classes_large_enough_and_apart(stage: Stage) -> None:
+    seen = 0
+    for seed in range(12):
+        picture = draw_scene(stage, np.random.default_rng(seed), SceneMix(empty=0.0))
+        assert picture.colour.shape == (INTRINSICS.height, INTRINSICS.width, 3)
+        for label in picture.labels:
+            assert label.name in CLASSES
+            assert label.mask.sum() >= LEAST_PIXELS
+            left, top, right, bottom = label.box()
+            outside = label.mask.copy()
+            outside[top:bottom, left:right] = False
+            assert not outside.any()
+            assert label.mask[top, :].any() and label.mask[bottom - 1, :].any()
+            assert label.mask[:, left].any() and label.mask[:, right - 1].any()
+        stacked = sum(label.mask.astype(int) for label in picture.labels)
+        assert np.max(stacked) <= 1
+        seen += len(picture.labels)
+    assert seen >= 6
+
+
+@needs_egl
+def test_an_empty_scene_has_no_labels(stage: Stage) -> None:
+    for seed in range(4):
+        assert draw_scene(stage, np.random.default_rng(seed), SceneMix(empty=1.0)).labels == ()
+
+
+@needs_egl
+@pytest.mark.parametrize("name", CLASSES)
+def test_a_scenario_has_the_mask_that_the_twin_has(stage: Stage, name: str) -> None:
+    config = SceneConfig(object=name, distance_m=0.48, lateral_m=-0.15, pitch_deg=45.0)
+    pose = config.T_base_object()
+    picture = draw_scenario(stage, name, pose, np.random.default_rng(0))
+    world = World(config)
+    data = world.snapshot()
+    quat = np.empty(4)
+    mujoco.mju_mat2Quat(quat, pose[:3, :3].ravel().copy())
+    data.qpos[:] = [*HOME, *pose[:3, 3], *quat]
+    mujoco.mj_forward(world.model, data)
+    renderer = make_renderer(world.model, INTRINSICS, "egl")
+    twin = renderer.render(data).mask
+    renderer.close()
+    ours = picture.labels[0].mask
+    assert (ours & twin).sum() / (ours | twin).sum() > 0.99
+
+
+@needs_egl
+def test_what_an_occluder_covers_belongs_to_no_label_and_what_hardly_shows_is_taken_away(stage: Stage) -> None:
+    T_base_camera = stage.set_arm(HOME)
+    cylinder, card = stage.named("cylinder")[0], stage.distractors()[0]
+    pose = SceneConfig(object="cylinder").T_base_object()
+    stage.clear()
+    stage.put(cylinder, pose)
+    alone = stage.draw_instances("wrist", "pieces") == stage.actors.index(cylinder)
+    between = np.eye(4)
+    between[:3, 3] = 0.6 * pose[:3, 3] + 0.4 * T_base_camera[:3, 3]
+    stage.put(card, between)
+    instances = stage.draw_instances("wrist", "pieces")
+    behind = instances == stage.actors.index(cylinder)
+    assert behind.sum() < alone.sum()
+    assert not (behind & ~alone).any()
+    assert (instances == stage.actors.index(card)).any()
+    stage.hide(cylinder)
+    assert not (stage.draw_instances("wrist", "pieces") == stage.actors.index(cylinder)).any()
+
+
+@needs_egl
+def test_every_label_shows_enough_of_its_outline(stage: Stage) -> None:
+    for seed in range(20, 32):
+        picture = draw_scene(stage, np.random.default_rng(seed), SceneMix(empty=0.0, wrist=0.0, occluded=1.0))
+        camera = stage.T_base_camera("free")
+        for label in picture.labels:
+            areas = []
+            for actor in stage.named(label.name):
+                pose = stage.pose(actor)
+                corners = [points @ pose[:3, :3].T + pose[:3, 3] for points in actor.prop.corners()]
+                areas.append(outline_area(corners, camera, stage.intrinsics))
+            assert label.mask.sum() >= min(LEAST_SHARE * min(areas), 0.08 * label.mask.size)
+
+
+def test_the_outline_of_a_plate_square_to_the_camera_is_its_size_in_pixels() -> None:
+    plate = np.array([[x, y, 0.5] for x in (-0.05, 0.05) for y in (-0.03, 0.03)])
+    wanted = 0.10 * INTRINSICS.fx / 0.5 * 0.06 * INTRINSICS.fy / 0.5
+    assert outline_area([plate], np.eye(4), INTRINSICS) == pytest.approx(wanted, rel=0.06)
+
+
+def test_what_comes_too_near_the_lens_has_no_outline() -> None:
+    assert outline_area([np.array([[0.0, 0.0, 0.03], [0.0, 0.1, 0.3]])], np.eye(4), INTRINSICS) == np.inf
+
+
+def test_props_keep_the_proportions_that_tell_them_from_distractors() -> None:
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        box = np.ptp(np.vstack(make_class_prop("box", rng).corners()), axis=0)
+        assert box.min() >= 0.028
+        cylinder = np.ptp(np.vstack(make_class_prop("cylinder", rng).corners()), axis=0)
+        assert cylinder[2] >= 1.69 * cylinder[0]
+        bottle = make_class_prop("bottle", rng)
+        assert len(bottle.parts) == len(OBJECTS["bottle"].parts) + 1
+        assert make_distractor(rng).kind not in CLASSES
+    assert np.ptp(np.vstack(nominal_prop("bottle").corners()), axis=0)[2] == pytest.approx(0.200)
+
+
+def test_textures_are_pictures_and_come_from_their_seed() -> None:
+    for seed in range(30):
+        picture = random_texture(np.random.default_rng(seed), 64)
+        assert picture.shape == (64, 64, 3) and picture.dtype == np.uint8
+        assert np.array_equal(picture, random_texture(np.random.default_rng(seed), 64))
+    assert len({random_texture(np.random.default_rng(seed), 64).tobytes() for seed in range(30)}) == 30
+
+
+def test_a_photograph_is_noisy_in_every_channel_and_brought_to_a_fair_exposure() -> None:
+    dark = np.full((120, 160, 3), 12, np.uint8)
+    noise = []
+    for seed in range(20):
+        photo = spoil_photo(dark, np.random.default_rng(seed))
+        assert photo.shape == dark.shape and photo.dtype == np.uint8
+        assert photo.mean() > dark.mean()
+        noise.append(photo.std(axis=(0, 1)))
+    assert (np.median(noise, axis=0) > 1.0).all()
