@@ -16,10 +16,10 @@ MIN_CORNERS = 8
 """A view with fewer corners is refused: its pose would hang on too little."""
 MIN_SHARE = 0.6
 """A view with a smaller share of the board's corners gets the warning `partly_hidden`."""
-BLURRED = 0.25
-"""A view less sharp than this gets the warning `blurred`: its edges are 4 pixels wide."""
-TOO_BLURRED = 0.14
-"""A view less sharp than this is refused: its edges are 7 pixels wide."""
+BLURRED = 0.3
+"""A view less sharp than this [1/px] gets the warning `blurred`; sharp ones have 0.5 and more."""
+TOO_BLURRED = 0.18
+"""A view less sharp than this is refused."""
 
 _BAD_FIT = 0.15  # of a square's edge: corners further than this from where the pattern puts them are of another board
 _OTHER_FAMILIES = ("DICT_4X4_1000", "DICT_5X5_1000", "DICT_6X6_1000", "DICT_7X7_1000", "DICT_APRILTAG_36h11")
@@ -49,13 +49,13 @@ def detect_board(image: np.ndarray, board: Board) -> BoardView:
             another one are seen); `hidden_board` (fewer than `MIN_CORNERS` corners); `blurred` (too blurred to use).
     """
     grey = _grey(image)
-    ids, pixels, n_markers = _find(grey, board)
+    ids, pixels = _find(grey, board)
     if len(ids) < MIN_CORNERS:
-        raise _why_not(grey, board, len(ids), n_markers)
+        raise _why_not(grey, board, len(ids))
     _check_layout(ids, pixels, board)
     sharpness = _sharpness(grey, ids, pixels, board)
     if sharpness < TOO_BLURRED:
-        raise _blurred(f"edges are {1 / sharpness:.0f} px wide, allowed are {1 / TOO_BLURRED:.0f}")
+        raise _blurred(f"its edges are {1 / sharpness:.0f} px wide, allowed are {1 / TOO_BLURRED:.0f}")
     return BoardView(
         ids=ids,
         pixels_px=pixels,
@@ -73,16 +73,14 @@ def _grey(image: np.ndarray) -> np.ndarray:
     return image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
 
 
-def _find(grey: np.ndarray, board: Board) -> tuple[np.ndarray, np.ndarray, int]:
-    """Return ids (N,), pixels (N, 2) and the number of markers; OpenCV 5 has dropped an axis that 4 had, so both are
-    brought to these shapes."""
-    corners, ids, _, marker_ids = _detector(board).detectBoard(grey)
-    n_markers = 0 if marker_ids is None else np.size(marker_ids)
+def _find(grey: np.ndarray, board: Board) -> tuple[np.ndarray, np.ndarray]:
+    """Return ids (N,) and pixels (N, 2); OpenCV 5 dropped an axis that 4 had, so both are brought to these shapes."""
+    corners, ids, _, _ = _detector(board).detectBoard(grey)
     if ids is None or corners is None:
-        return np.zeros(0, int), np.zeros((0, 2)), n_markers
+        return np.zeros(0, int), np.zeros((0, 2))
     ids, corners = np.ravel(ids).astype(int), np.reshape(corners, (-1, 2)).astype(np.float64)
     order = np.argsort(ids)
-    return ids[order], corners[order], n_markers
+    return ids[order], corners[order]
 
 
 @lru_cache(maxsize=8)
@@ -96,34 +94,43 @@ def _marker_ids(grey: np.ndarray, family: str) -> np.ndarray:
     return np.zeros(0, int) if ids is None else np.unique(np.ravel(ids))
 
 
-def _why_not(grey: np.ndarray, board: Board, n_corners: int, n_markers: int) -> CalibrationError:
+def _why_not(grey: np.ndarray, board: Board, n_corners: int) -> CalibrationError:
     """Return the error that tells why a board was not found: another one, a blurred one, a hidden one, or none."""
-    other = replace(board, legacy=not board.legacy)
-    if len(_find(grey, other)[0]) >= MIN_CORNERS:
-        return _wrong(f"its markers sit on the other colour; set `legacy` to {other.legacy}")
+    sharpness = _picture_sharpness(grey)
+    if sharpness < BLURRED:
+        return _blurred(f"its edges are {1 / sharpness:.0f} px wide, and it cannot be read")
     markers = _marker_ids(grey, board.dictionary)
-    own = board.columns * board.rows // 2
-    if (markers >= own).any():
-        return _wrong(f"markers {markers[markers >= own].tolist()} are seen, and this one has 0 … {own - 1}")
-    if n_corners == 0 and len(markers) < 2:
-        for family in _OTHER_FAMILIES:
-            seen = _marker_ids(grey, family)
-            # one marker may be read by chance out of any picture, three are not
-            if len(seen) >= 3 and family.rsplit("_", 1)[0] not in board.dictionary:
-                return _wrong(f"its markers are of {family.rsplit('_', 1)[0]}, not of {board.dictionary}")
+    other = _other_board(grey, board, n_corners, markers)
+    if other is not None:
+        return _wrong(other)
     if n_corners >= MIN_CORNERS // 2 or len(markers) >= 2:
         return CalibrationError(
             "hidden_board",
             f"only {n_corners} corners of the board are seen, {MIN_CORNERS} are needed; "
             "uncover it, bring all of it into the image, and keep reflections off.",
         )
-    for scale in (0.5, 0.25):
-        small = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-        if len(_find(small, board)[0]) >= MIN_CORNERS:
-            return _blurred("its markers can be read only in the reduced picture")
     return CalibrationError(
         "no_board", "no board is seen: bring it into the image, nearer, into more light, and let the arm come to rest."
     )
+
+
+def _other_board(grey: np.ndarray, board: Board, n_corners: int, markers: np.ndarray) -> str | None:
+    """Return what tells that another board is in the picture; None when nothing does."""
+    other = replace(board, legacy=not board.legacy)
+    if len(_find(grey, other)[0]) >= MIN_CORNERS:
+        return f"its markers sit on the other colour; set `legacy` to {other.legacy}"
+    own = board.columns * board.rows // 2
+    if (markers >= own).any():
+        return f"markers {markers[markers >= own].tolist()} are seen, and this one has 0 … {own - 1}"
+    if len(markers) >= own / 2:
+        return f"its markers are not arranged in {board.columns} columns and {board.rows} rows of squares"
+    if n_corners == 0 and len(markers) < 2:
+        for family in _OTHER_FAMILIES:
+            seen = _marker_ids(grey, family)
+            # one marker may be read by chance out of any picture, three are not
+            if len(seen) >= 3 and family.rsplit("_", 1)[0] not in board.dictionary:
+                return f"its markers are of {family.rsplit('_', 1)[0]}, not of {board.dictionary}"
+    return None
 
 
 def _check_layout(ids: np.ndarray, pixels: np.ndarray, board: Board) -> None:
@@ -178,6 +185,23 @@ def _edge_slope(grey: np.ndarray, ends: np.ndarray) -> float:
     return float(np.median(slope.max(axis=1) / contrast))
 
 
+def _picture_sharpness(grey: np.ndarray) -> float:
+    """Return the same measure for a picture in which no board was read: from its strongest edges, wherever they are.
+
+    1 for a picture without strong edges: that is empty, not blurred.
+    """
+    window = np.ones((13, 13), np.uint8)
+    contrast = cv2.dilate(grey, window).astype(np.float32) - cv2.erode(grey, window)
+    strong = contrast > 80.0
+    if strong.mean() < 0.01:
+        return 1.0
+    found = []
+    for dx, dy in ((1, 0), (0, 1)):
+        slope = np.abs(cv2.Sobel(grey, cv2.CV_32F, dx, dy, ksize=3)) / 8.0
+        found.append(float(np.percentile(cv2.dilate(slope, window)[strong] / contrast[strong], 90)))
+    return min(found)
+
+
 def _warnings(n_seen: int, n_corners: int, sharpness: float) -> list[CalibrationWarning]:
     found = []
     if n_seen < MIN_SHARE * n_corners:
@@ -185,8 +209,8 @@ def _warnings(n_seen: int, n_corners: int, sharpness: float) -> list[Calibration
         found.append(CalibrationWarning(code="partly_hidden", message=message))
     if sharpness < BLURRED:
         message = (
-            f"the board's edges are {1 / sharpness:.1f} px wide, {1 / BLURRED:.0f} are good: let the arm come to rest, "
-            "add light for a shorter exposure, or move away."
+            f"the board's edges are {1 / sharpness:.1f} px wide, up to {1 / BLURRED:.0f} is good: let the arm come to "
+            "rest, add light for a shorter exposure, or move away."
         )
         found.append(CalibrationWarning(code="blurred", message=message))
     return found

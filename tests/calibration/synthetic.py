@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -100,3 +101,22 @@ def corrupt(recording: Recording, index: int, step: np.ndarray) -> Recording:
     arm = recording.Ts_base_flange.copy()
     arm[index] = moved(arm[index], step)
     return replace(recording, Ts_base_flange=arm)
+
+
+def photograph(
+    T_camera_board: np.ndarray, board: Board = BOARD, *, camera: CameraModel = CAMERA, seed: int = 0
+) -> np.ndarray:
+    """Return a picture (H, W, 3) of `board` on a grey table: drawn four times too large, averaged, with noise."""
+    pixels, border, finer = 140, 70, 4
+    texture = cv2.copyMakeBorder(board.image(pixels), *[border] * 4, cv2.BORDER_CONSTANT, value=255)
+    step = board.square_m / pixels
+    in_board = np.array([[step, 0.0, (0.5 - border) * step], [0.0, step, (0.5 - border) * step], [0.0, 0.0, 1.0]])
+    finer_pixels = np.array([[finer, 0.0, (finer - 1) / 2], [0.0, finer, (finer - 1) / 2], [0.0, 0.0, 1.0]])
+    plane = np.column_stack([T_camera_board[:3, :2], T_camera_board[:3, 3]])
+    width, height = camera.size
+    large = cv2.warpPerspective(
+        texture, finer_pixels @ camera.matrix @ plane @ in_board, (width * finer, height * finer), borderValue=120
+    )
+    grey = 38.0 + 0.7 * cv2.resize(large, camera.size, interpolation=cv2.INTER_AREA)
+    noisy = grey + np.random.default_rng(seed).normal(0.0, 1.5, grey.shape)
+    return np.repeat(np.clip(np.rint(noisy), 0, 255).astype(np.uint8)[..., None], 3, axis=2)
