@@ -109,9 +109,11 @@ class ProcessGenerator:
         """Return the answer to `request`, or to nothing the first; a child that fails is ended and forgotten."""
         try:
             return child.ask(request, timeout_s)
-        except GeneratorError as err:
+        except BaseException as err:  # also Ctrl-C: what was asked would be taken for the next answer
             self._child = None
             child.end()
+            if not isinstance(err, GeneratorError):
+                raise
             raise GeneratorError(f"the process of {self._name} {err}{child.last_words()}") from err
 
 

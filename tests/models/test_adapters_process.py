@@ -6,6 +6,7 @@ import io
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -96,6 +97,21 @@ def test_a_process_that_hangs_is_ended_in_time(tmp_path):
     generator = make(tmp_path, READY + SERVE, timeout_s=0.5)
     with pytest.raises(GeneratorError, match=r"no answer in 0\.5 s and was ended"):
         generator.sample(CLOUD, 1, 3)
+
+
+def test_ctrl_c_while_waiting_ends_it_too(tmp_path, monkeypatch):
+    generator = make(tmp_path, READY + SERVE)
+    child = generator._child
+    assert child is not None
+
+    def interrupt(timeout: float) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(child, "_answers", SimpleNamespace(get=interrupt))
+    with pytest.raises(KeyboardInterrupt):
+        generator.sample(CLOUD, 1, 3)
+    assert child._process.returncode is not None
+    assert len(generator.sample(CLOUD, 1, 0)) == 1
 
 
 def test_one_that_does_not_start_says_its_last_words(tmp_path):
