@@ -1,13 +1,17 @@
 """Makes the grasp generator's training data: procedural shapes, noisy single views, verified antipodal grasps.
 
-    python -m scripts.make_grasp_dataset                  # 24 shards of 100 shapes × 4 views into out/graspgen/agnostic
+    python -m scripts.make_grasp_dataset                  # 64 shards of 100 shapes × 4 views into out/graspgen/agnostic
     python -m scripts.make_grasp_dataset --shards 2       # a small one
+    python -m scripts.make_grasp_dataset --gripper z1     # for the Z1's own beak
 
 Shards that exist are kept, so an interrupted run goes on where it stopped. Each is made from its own seed.
+Every label passes the exact check; one of each shape is also shaken in MuJoCo: `<shard>.shaken.json` has the outcome.
 """
 
 from __future__ import annotations
 
+import json
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,7 +20,8 @@ import tyro
 from rich.progress import track
 
 from models.graspgen.cloud import prepare_cloud
-from models.graspgen.labels import GRIPPERS, GripperSpec, find_grasps
+from models.graspgen.labels import GRIPPERS, GripperSpec, Hand, check_grasps, find_grasps
+from models.graspgen.shake import shake_grasps
 from models.graspgen.shapes import FAMILY_WEIGHTS, make_shape
 from models.graspgen.solids import Solid
 from models.graspgen.views import ViewConfig, render_view
@@ -32,12 +37,14 @@ class Config:
 
     gripper: str = "agnostic"
     """Which hand of `models.graspgen.labels.GRIPPERS`."""
-    shards: int = 24
+    shards: int = 64
     """Files to make."""
     shapes: int = 100
     """Shapes in a file."""
     views: int = 4
     """Views of each shape."""
+    shaken: int = 1
+    """Labels of each shape that are tried in dynamics; none for the beak, whose jaws are not modelled there."""
     seed: int = 1000
     """Seed of the first shard; shard k takes seed + k."""
     out: Path = Path("out/graspgen")
@@ -46,19 +53,41 @@ class Config:
 
 def main(config: Config) -> None:
     """Make the shards that are missing."""
-    folder = config.out / config.gripper
+    folder, gripper = config.out / config.gripper, GRIPPERS[config.gripper]
     folder.mkdir(parents=True, exist_ok=True)
     for shard in track(range(config.shards), description="shards"):
         path = folder / f"{config.seed + shard}.npz"
-        if path.exists():
-            continue
-        arrays = make_shard(GRIPPERS[config.gripper], config.seed + shard, config.shapes, config.views)
-        partial = path.with_suffix(".partial.npz")
-        np.savez(partial, allow_pickle=False, **arrays)
-        partial.rename(path)
+        if not path.exists():
+            save_shard(path, make_shard(gripper, config.seed + shard, config.shapes, config.views))
+        verdicts = path.with_suffix(".shaken.json")
+        if config.shaken and isinstance(gripper, GripperSpec) and not verdicts.exists():
+            with np.load(path, allow_pickle=False) as arrays:
+                verdicts.write_text(json.dumps(shake_shard(dict(arrays), gripper, config.shaken)) + "\n")
 
 
-def make_shard(gripper: GripperSpec, seed: int, n_shapes: int, n_views: int) -> dict[str, np.ndarray]:
+def save_shard(path: Path, arrays: dict[str, np.ndarray]) -> None:
+    """Write a shard so that it is whole or not there."""
+    partial = path.with_suffix(".partial.npz")
+    np.savez(partial, allow_pickle=False, **arrays)
+    partial.rename(path)
+
+
+def shake_shard(arrays: dict[str, np.ndarray], gripper: GripperSpec, count: int) -> dict:
+    """Return how many of `count` labels of each shape were tried in dynamics, and which were lost, by family."""
+    tried: Counter[str] = Counter()
+    lost: Counter[str] = Counter()
+    for family, parts, profiles, T, n in zip(
+        *(arrays[key] for key in ("family", "parts", "profiles", "grasps", "n_grasps")), strict=True
+    ):
+        solid = Solid(family=str(family), parts=parts, profiles=profiles)
+        labels = T[: min(count, n)].astype(np.float64)  # a shard's labels are in random order
+        held = shake_grasps(solid, labels, check_grasps(solid, labels, gripper), gripper)
+        tried[solid.family] += len(held)
+        lost[solid.family] += int((~held).sum())
+    return {"tried": dict(tried), "lost": dict(+lost)}
+
+
+def make_shard(gripper: Hand, seed: int, n_shapes: int, n_views: int) -> dict[str, np.ndarray]:
     """Return one shard's arrays; S shapes, V = S × views.
 
     `clouds` (V, 512, 6) points and normals in the view frame, `T_view_object` (V, 4, 4), `shape` (V,) index of the

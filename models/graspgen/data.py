@@ -70,10 +70,11 @@ def load_shards(folder: Path, limit: int | None = None) -> GraspData:
     return GraspData(shape=np.concatenate([s["shape"] + f for s, f in zip(shards, firsts, strict=True)]), **joined)
 
 
-def augment(cloud: Tensor, grasps: Tensor) -> tuple[Tensor, Tensor]:
+def augment(cloud: Tensor, grasps: Tensor, symmetric: bool = True) -> tuple[Tensor, Tensor]:
     """Return clouds (B, N, 6) and grasps (B, K, 10) mirrored, turned, scaled and shifted together.
 
-    A parallel jaw is its own mirror image, so both image axes may be mirrored; the turn is about the view ray.
+    Hands look the same mirrored along x, so both image axes may be mirrored; the turn is about the view ray. Those that
+    are `symmetric` along y too, as a parallel jaw is, may also be turned over.
     """
     batch = len(cloud)
     angle = 0.15 * torch.randn(batch)
@@ -88,6 +89,6 @@ def augment(cloud: Tensor, grasps: Tensor) -> tuple[Tensor, Tensor]:
     points = cloud[..., :3] @ Rt * scale + shift + 0.0005 * torch.randn_like(cloud[..., :3])
     turned = torch.cat([points, cloud[..., 3:] @ Rt], dim=-1)
     position = grasps[..., :3] @ Rt * scale + shift / POSITION_SCALE_M
-    flip = torch.where(torch.rand(*grasps.shape[:2], 1) < 0.5, -1.0, 1.0)
+    flip = torch.where(torch.rand(*grasps.shape[:2], 1) < 0.5 * symmetric, -1.0, 1.0)
     axes = [grasps[..., 3:6] @ Rt, grasps[..., 6:9] @ Rt * flip]
     return turned, torch.cat([position, *axes, grasps[..., 9:]], dim=-1)

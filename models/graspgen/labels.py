@@ -1,14 +1,17 @@
-"""What counts as a grasp: a parallel jaw as data, ground-truth grasps of a solid, and an exact check of any grasp."""
+"""What counts as a grasp: hands as data, ground-truth grasps of a solid, and an exact check of any grasp."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from numba import njit
 
+from models.graspgen.beak import LAY, BeakSpec, check_beak
 from models.graspgen.solids import Solid, distance_at, normal_at, trace
 
+_LAY = np.array(LAY)
 _SAME_CONTACT_M = 0.0015  # a pad lies on all points it would reach within this distance
 
 
@@ -37,6 +40,8 @@ class GripperSpec:
     """Greatest reach of the fingertips past the contacts in ground truth [m]."""
     friction: float = 0.5
     """Coulomb coefficient that a valid grasp may count on."""
+    symmetric: ClassVar[bool] = True
+    """Whether the hand looks the same turned over."""
 
     def __post_init__(self) -> None:
         if not 0.0 < self.min_width_m < self.max_width_m:
@@ -62,7 +67,11 @@ class GripperSpec:
         return np.ascontiguousarray(grid[:, [0, 2]])
 
 
-GRIPPERS = {"agnostic": GripperSpec(name="agnostic", max_width_m=0.136)}
+Hand = GripperSpec | BeakSpec
+GRIPPERS: dict[str, Hand] = {
+    "agnostic": GripperSpec(name="agnostic", max_width_m=0.136),
+    "z1": BeakSpec(name="z1"),
+}
 """Hands that weights can be trained for; `agnostic` has the opening of a Robotiq 2F-140 (its datasheet)."""
 
 
@@ -84,9 +93,24 @@ class GraspCheck:
         """(N,) bool, free and antipodal."""
         return self.free & self.antipodal
 
+    def __getitem__(self, index: np.ndarray | slice) -> GraspCheck:
+        """Return what is said of the grasps that `index` picks."""
+        return GraspCheck(
+            free=self.free[index],
+            antipodal=self.antipodal[index],
+            widths_m=self.widths_m[index],
+            offsets_m=self.offsets_m[index],
+        )
+
 
 def check_grasps(
-    solid: Solid, T: np.ndarray, gripper: GripperSpec, clearance_m: float = 0.0, cone_rad: float | None = None
+    solid: Solid,
+    T: np.ndarray,
+    gripper: Hand,
+    widths_m: np.ndarray | None = None,
+    *,
+    clearance_m: float = 0.0,
+    cone_rad: float | None = None,
 ) -> GraspCheck:
     """Return whether the grasps `T` (N, 4, 4) in the solid's frame hold.
 
@@ -94,20 +118,31 @@ def check_grasps(
         solid: the true object.
         T: poses in the grasp frame (z approach, y closing).
         gripper: the hand.
+        widths_m: (N,) what is to be held is said to be this wide; a beak is laid around it, a parallel jaw needs none.
         clearance_m: free space that the open hand needs.
         cone_rad: greatest angle between closing line and contact normal; the gripper's friction cone if None.
+
+    Raises:
+        ValueError: the hand is a beak, and no widths are given.
     """
     cone = float(np.arctan(gripper.friction)) if cone_rad is None else cone_rad
-    half = gripper.max_width_m / 2.0
     T = np.ascontiguousarray(T, dtype=np.float64)
-    free, antipodal, widths, offsets = _check(
-        solid.parts, solid.profiles, T, gripper.body_points(), gripper.pad_points(), half, clearance_m, np.cos(cone)
-    )
+    shape = (solid.parts, solid.profiles, T)
+    if isinstance(gripper, BeakSpec):
+        if widths_m is None:
+            raise ValueError(f"Grasps of the hand {gripper.name!r} are checked with their widths; give widths_m (N,).")
+        widths = np.ascontiguousarray(np.broadcast_to(widths_m, len(T)), dtype=np.float64)
+        body = (gripper.fixed_points, gripper.turning_points)
+        faces = (gripper.fixed_face_points, gripper.turning_face_points)
+        free, antipodal, widths, offsets = check_beak(*shape, widths, *body, *faces, _LAY, clearance_m, np.cos(cone))
+    else:
+        body = (gripper.body_points(), gripper.pad_points(), gripper.max_width_m / 2.0)
+        free, antipodal, widths, offsets = _check(*shape, *body, clearance_m, np.cos(cone))
     return GraspCheck(free=free, antipodal=antipodal, widths_m=widths, offsets_m=offsets)
 
 
 def find_grasps(
-    solid: Solid, gripper: GripperSpec, rng: np.random.Generator, n_contacts: int = 900, n_turns: int = 4
+    solid: Solid, gripper: Hand, rng: np.random.Generator, n_contacts: int = 900, n_turns: int = 4
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return ground-truth grasps (N, 4, 4) of `solid` from all sides and their widths (N,) [m].
 
@@ -129,7 +164,7 @@ def find_grasps(
     T = np.tile(np.eye(4), (len(first), 1, 1))
     T[:, :3, :3] = np.stack([np.cross(closing, approach), closing, approach], axis=2)
     T[:, :3, 3] = first + 0.5 * widths[:, None] * closing + depth * approach
-    check = check_grasps(solid, T, gripper, clearance_m=0.003, cone_rad=0.3)
+    check = check_grasps(solid, T, gripper, widths, clearance_m=0.003, cone_rad=0.3)
     good = check.valid & (np.abs(check.offsets_m) < 0.004)
     return T[good], check.widths_m[good]
 

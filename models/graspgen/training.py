@@ -1,21 +1,22 @@
-"""Trains the generator, lets the exact check judge its samples, and trains the discriminator on those."""
+"""Trains the generator, and the discriminator on what was said of the generator's samples."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 import torch
+from scipy.optimize import minimize
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from models.graspgen.data import GraspData, augment
-from models.graspgen.labels import GripperSpec, check_grasps
-from models.graspgen.network import N_COORDINATES, Denoiser, Discriminator, decode_grasps, encode_grasps
+from models.graspgen.judging import JudgedSamples, JudgingConfig
+from models.graspgen.network import Denoiser, Discriminator, encode_grasps
 
 Network = TypeVar("Network", bound=nn.Module)
 Progress = Callable[[int, float], None]
@@ -32,40 +33,42 @@ class TrainingConfig:
     grasps_per_view: int = 72
     discriminator_iterations: int = 5000
     discriminator_rate: float = 1.0e-3
-    judged_views: int = 10000
-    """Views whose samples the exact check labels."""
-    samples_per_view: int = 64
-    """Of the generator's own."""
-    perturbed_per_view: int = 32
-    """Ground truth knocked aside by up to 20 mm and some 20°."""
-    steps: int = 8
-    """Denoising steps with which those samples are made."""
+    judging: JudgingConfig = field(default_factory=JudgingConfig)
     seed: int = 0
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class JudgedSamples:
-    """Grasps with the exact check's verdicts."""
+def train_generator(
+    data: GraspData,
+    config: TrainingConfig,
+    checkpoint: Path,
+    progress: Progress,
+    *,
+    symmetric: bool = True,
+    start_from: Denoiser | None = None,
+) -> Denoiser:
+    """Return the generator, its weights averaged over the last iterations; goes on from `checkpoint` if it is there.
 
-    views: np.ndarray
-    """(J,) indices of the views."""
-    grasps: Tensor
-    """(J, K, 10)."""
-    valid: Tensor
-    """(J, K) 1.0 where the check passed."""
-
-
-def train_generator(data: GraspData, config: TrainingConfig, checkpoint: Path, progress: Progress) -> Denoiser:
-    """Return the generator, its weights averaged over the last iterations; goes on from `checkpoint` if it is there."""
+    Args:
+        data: what to learn.
+        config: how long and how fast.
+        checkpoint: file to go on from and to write.
+        progress: told of each iteration.
+        symmetric: whether the hand is its own mirror image.
+        start_from: another hand's generator, to be tuned for this one.
+    """
     model = _seeded(Denoiser, config.seed)
+    if start_from is not None:
+        model.load_state_dict(start_from.state_dict())
     average = _seeded(Denoiser, config.seed)
+    average.load_state_dict(model.state_dict())
     n_views = len(data.clouds)
 
     def loss_at(rng: np.random.Generator) -> Tensor:
         views = rng.integers(0, n_views, config.views_per_batch)
         T, widths = data.draw_grasps(views, config.grasps_per_view, rng)
         grasps = encode_grasps(torch.from_numpy(T), torch.from_numpy(widths))
-        cloud, grasps = augment(torch.from_numpy(data.clouds[views].astype(np.float32)), grasps)
+        cloud = torch.from_numpy(data.clouds[views].astype(np.float32))
+        cloud, grasps = augment(cloud, grasps, symmetric)
         return model.loss(cloud, grasps)
 
     for iteration, loss in _descend(
@@ -81,33 +84,6 @@ def train_generator(data: GraspData, config: TrainingConfig, checkpoint: Path, p
     return average.eval()
 
 
-def judge_samples(
-    generator: Denoiser, data: GraspData, gripper: GripperSpec, config: TrainingConfig, progress: Progress
-) -> JudgedSamples:
-    """Return the generator's own samples and perturbed ground truth with the exact check's verdicts."""
-    rng = np.random.default_rng(config.seed + 1)
-    torch.manual_seed(config.seed + 1)
-    views = rng.permutation(len(data.clouds))[: config.judged_views]
-    grasps, valid = [], []
-    for start in range(0, len(views), 16):
-        part = views[start : start + 16]
-        cloud = torch.from_numpy(data.clouds[part].astype(np.float32))
-        noise = torch.randn(len(part), config.samples_per_view, N_COORDINATES)
-        with torch.autocast("cpu", torch.bfloat16):
-            own = generator.sample(cloud, noise, config.steps)
-        T, widths = data.draw_grasps(part, config.perturbed_per_view, rng)
-        v = torch.cat([own, _perturbed(encode_grasps(torch.from_numpy(T), torch.from_numpy(widths)))], dim=1)
-        T_view, _ = decode_grasps(v.double())
-        for row, view in enumerate(part):
-            T_object = np.linalg.inv(data.T_view_object[view].astype(np.float64)) @ T_view[row].numpy()
-            valid.append(check_grasps(data.solid(view), T_object, gripper).valid)
-        grasps.append(v)
-        progress(start + len(part), float(np.mean(valid[-len(part) :])))
-    return JudgedSamples(
-        views=views, grasps=torch.cat(grasps), valid=torch.from_numpy(np.array(valid, dtype=np.float32))
-    )
-
-
 def train_discriminator(
     generator: Denoiser,
     data: GraspData,
@@ -116,8 +92,9 @@ def train_discriminator(
     config: TrainingConfig,
     checkpoint: Path,
     progress: Progress,
+    symmetric: bool = True,
 ) -> Discriminator:
-    """Return the discriminator; its encoder starts from the generator's."""
+    """Return the discriminator; its encoder starts from the generator's. `symmetric` as for that."""
     model = _seeded(Discriminator, config.seed)
     model.encoder.load_state_dict(generator.encoder.state_dict())
     average = _seeded(Discriminator, config.seed)
@@ -126,7 +103,7 @@ def train_discriminator(
     def loss_at(rng: np.random.Generator) -> Tensor:
         rows = rng.integers(0, len(judged.views), 16)
         cloud = torch.from_numpy(data.clouds[judged.views[rows]].astype(np.float32))
-        cloud, grasps = augment(cloud, judged.grasps[rows])
+        cloud, grasps = augment(cloud, judged.grasps[rows], symmetric)
         return F.binary_cross_entropy_with_logits(model(cloud, grasps).float(), judged.valid[rows])
 
     for iteration, loss in _descend(
@@ -142,16 +119,41 @@ def train_discriminator(
     return average.eval()
 
 
+def calibrate_discriminator(
+    discriminator: Discriminator, data: GraspData, judged: JudgedSamples
+) -> tuple[float, float]:
+    """Set scale and offset of the discriminator's logits so that its scores are the shares that hold; return both.
+
+    Args:
+        discriminator: changed in its last layer.
+        data: shapes that it was not trained on.
+        judged: what was said of samples on those.
+    """
+    with torch.inference_mode():
+        logits = torch.cat(
+            [
+                discriminator(torch.from_numpy(data.clouds[[view]].astype(np.float32)), grasps[None])
+                for view, grasps in zip(judged.views, judged.grasps, strict=True)
+            ]
+        )
+    x, y = logits.flatten().double().numpy(), judged.valid.flatten().double().numpy()
+
+    def surprise(parameters: np.ndarray) -> float:
+        z = parameters[0] * x + parameters[1]
+        return float(np.mean(np.logaddexp(0.0, z) - y * z))
+
+    scale, offset = (float(p) for p in minimize(surprise, [1.0, 0.0], method="Nelder-Mead").x)
+    last = discriminator.head.leave[-1]
+    assert isinstance(last, nn.Linear)
+    with torch.no_grad():
+        last.weight.mul_(scale)
+        last.bias.mul_(scale).add_(offset)
+    return scale, offset
+
+
 def _seeded(make: Callable[[], Network], seed: int) -> Network:
     torch.manual_seed(seed)
     return make()
-
-
-def _perturbed(v: Tensor) -> Tensor:
-    """Return grasps (B, K, 10) each knocked aside by its own random amount."""
-    amount = torch.rand(*v.shape[:2], 1)
-    scale = torch.tensor([0.4] * 3 + [0.35] * 6 + [0.2])
-    return v + amount * scale * torch.randn_like(v)
 
 
 def _descend(

@@ -6,9 +6,15 @@ import torch
 
 from models.graspgen.cloud import N_POINTS, find_view_frame, prepare_cloud
 from models.graspgen.data import augment, load_shards
+from models.graspgen.judging import JudgingConfig, judge_samples
 from models.graspgen.labels import GRIPPERS, check_grasps
 from models.graspgen.network import Denoiser, Discriminator, decode_grasps, encode_grasps
-from models.graspgen.training import TrainingConfig, judge_samples, train_discriminator, train_generator
+from models.graspgen.training import (
+    TrainingConfig,
+    calibrate_discriminator,
+    train_discriminator,
+    train_generator,
+)
 from models.graspgen.weights import WeightsError, load_weights, save_weights
 from scripts.make_grasp_dataset import make_shard
 
@@ -66,14 +72,26 @@ def test_crooked_coordinates_still_decode_to_rotations():
     assert np.linalg.det(R) == pytest.approx(1.0)
 
 
-def test_augmenting_keeps_grasps_where_they_are_on_the_cloud():
+@pytest.mark.parametrize("symmetric", [True, False])
+def test_augmenting_keeps_grasps_where_they_are_on_the_cloud(symmetric):
     torch.manual_seed(0)
     cloud = torch.randn(3, N_POINTS, 6) * 0.04
     T = torch.eye(4).repeat(3, 5, 1, 1)
     T[..., :3, 3] = cloud[:, :5, :3]
-    moved_cloud, moved = augment(cloud, encode_grasps(T, torch.full((3, 5), 0.05)))
+    moved_cloud, moved = augment(cloud, encode_grasps(T, torch.full((3, 5), 0.05)), symmetric)
     positions = decode_grasps(moved)[0][..., :3, 3]
     assert (positions - moved_cloud[:, :5, :3]).norm(dim=-1).max() < 0.003  # the points' own jitter
+
+
+def test_only_a_hand_that_is_its_own_mirror_image_is_turned_over():
+    torch.manual_seed(0)
+    T = torch.eye(4).repeat(40, 6, 1, 1)
+    grasps = encode_grasps(T, torch.full((40, 6), 0.05))
+    cloud = torch.zeros(40, N_POINTS, 6)
+    for symmetric in (True, False):
+        closing = augment(cloud, grasps, symmetric)[1][..., 6:9]
+        same_way = (closing * closing[:, :1]).sum(-1) > 0.0  # within a cloud all were alike before
+        assert same_way.all() != symmetric
 
 
 def test_ground_truth_in_the_view_frame_still_holds_on_the_true_object(data):
@@ -109,13 +127,50 @@ def test_training_lowers_the_loss_and_resumes_where_it_stopped(data, tmp_path):
         assert torch.equal(a, b)
 
 
+def judged_by(generator: Denoiser, data, folder, seen=lambda *_: None, **settings):
+    config = JudgingConfig(**{"views": 8, "samples": 24, "perturbed": 24, "steps": 2} | settings)
+    return judge_samples(generator, data, HAND, config=config, seed=0, folder=folder / "judged", progress=seen)
+
+
+def test_judged_samples_are_kept_for_the_generator_that_made_them(data, tmp_path, monkeypatch):
+    first, other = Denoiser().eval(), Denoiser().eval()
+    judged = judged_by(first, data, tmp_path)
+    with monkeypatch.context() as patch:
+        patch.setattr("models.graspgen.judging.check_grasps", None)  # nothing may be judged anew
+        again = judged_by(first, data, tmp_path)
+    assert torch.equal(judged.grasps, again.grasps) and torch.equal(judged.valid, again.valid)
+    assert not torch.equal(judged.grasps[:, :24], judged_by(other, data, tmp_path).grasps[:, :24])
+
+
+def test_what_is_lost_when_shaken_counts_as_invalid(data, tmp_path, monkeypatch):
+    generator = Denoiser().eval()
+    unshaken = judged_by(generator, data, tmp_path / "none", shaken_share=0.0)
+    monkeypatch.setattr("models.graspgen.judging.shake_grasps", lambda _, T, *__: np.arange(len(T)) % 2 == 0)
+    judged = judged_by(generator, data, tmp_path / "all", shaken_share=1.0)
+    assert judged.shaken == unshaken.valid.sum() > 0
+    assert 0 < judged.lost == unshaken.valid.sum() - judged.valid.sum()
+    assert unshaken.shaken == unshaken.lost == 0
+
+
+def test_calibration_takes_back_what_a_discriminator_is_too_sure_of(data, tmp_path):
+    generator = Denoiser().eval()
+    judged = judged_by(generator, data, tmp_path, shaken_share=0.0)
+    sure, modest = Discriminator().eval(), Discriminator().eval()
+    sure.head.leave[-1].bias.data.fill_(4.0)
+    modest.load_state_dict(sure.state_dict())
+    scale, offset = calibrate_discriminator(modest, data, judged)
+    cloud = torch.from_numpy(data.clouds[judged.views].astype(np.float32))
+    before, after = (float(torch.sigmoid(d(cloud, judged.grasps)).mean()) for d in (sure, modest))
+    assert after == pytest.approx(float(judged.valid.mean()), abs=0.02)
+    assert before > after + 0.2
+    assert (scale, offset) != (1.0, 0.0)
+
+
 def test_the_discriminator_learns_from_the_generators_own_judged_samples(data, tmp_path):
     torch.set_num_threads(1)
-    config = TrainingConfig(
-        discriminator_iterations=20, judged_views=8, samples_per_view=24, perturbed_per_view=24, steps=2
-    )
+    config = TrainingConfig(discriminator_iterations=20)
     generator = Denoiser().eval()
-    judged = judge_samples(generator, data, HAND, config, lambda *_: None)
+    judged = judged_by(generator, data, tmp_path)
     assert judged.valid[:, 24:].mean() > judged.valid[:, :24].mean()  # near ground truth against an untrained net
     losses: list[float] = []
     train_discriminator(
