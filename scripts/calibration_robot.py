@@ -18,6 +18,7 @@ from hal.errors import HalTimeoutError
 
 if TYPE_CHECKING:
     from sim_twin.board import BoardSpec
+    from sim_twin.scene import SceneConfig
     from sim_twin.truth import Truth
 
 PIXELS_PER_SQUARE = 100
@@ -73,16 +74,8 @@ def open_robot(options: RobotOptions, board: Board, seed: int) -> Iterator[Calib
     """
     if options.hal == "sim":
         from scripts.demo_robot import lockstep_robot
-        from sim_twin.scene import SceneConfig
 
-        scene = SceneConfig(
-            seed=seed,
-            board=make_print(options, board),
-            mount_error_m=options.mount_error_m,
-            mount_error_deg=options.mount_error_deg,
-            mount_seed=options.mount_seed,
-        )
-        with lockstep_robot(scene) as robot:
+        with lockstep_robot(make_scene(options, board, seed)) as robot:
             yield CalibrationRobot(arm=robot.arm, camera=robot.camera, clock=robot.clock, truth=robot.truth)
         return
     with ExitStack() as undo:
@@ -109,6 +102,19 @@ def _served_truth(bus: BusConfig, undo: ExitStack) -> Callable[[], Truth] | None
         return client.truth if client.truth().T_base_board is not None else None
     except HalTimeoutError:
         return None
+
+
+def make_scene(options: RobotOptions, board: Board, seed: int) -> SceneConfig:
+    """Return the twin's scene with `board` on the table."""
+    from sim_twin.scene import SceneConfig
+
+    return SceneConfig(
+        seed=seed,
+        board=make_print(options, board),
+        mount_error_m=options.mount_error_m,
+        mount_error_deg=options.mount_error_deg,
+        mount_seed=options.mount_seed,
+    )
 
 
 def make_print(options: RobotOptions, board: Board) -> BoardSpec:

@@ -22,10 +22,11 @@ import tyro
 from rich.console import Console
 
 from calibration.board import Board
-from scripts.calibration_robot import CalibrationRobot, RobotOptions, open_robot
+from scripts.calibration_robot import RobotOptions, open_robot
 from scripts.calibration_samples import now
 
 if TYPE_CHECKING:
+    from sim_twin.truth import Truth
     from z1_runtime.calibration_capture import Capture, Key, Taken
 
 
@@ -49,6 +50,10 @@ class Config:
     """The board that lies there."""
     robot: Annotated[RobotOptions, tyro.conf.arg(name="")] = field(default_factory=RobotOptions)
     """Which robot."""
+
+    def __post_init__(self) -> None:
+        if self.poses < 1 or not 0.0 < self.speed <= 1.0:
+            raise ValueError(f"poses is {self.poses}, speed is {self.speed}; allowed are 1 and more, above 0 up to 1.")
 
 
 def main(config: Config) -> int:
@@ -79,7 +84,7 @@ def capture(config: Config, console: Console, pressed: Callable[[], Key] | None 
         robot = undo.enter_context(open_robot(config.robot, config.board, config.seed))
         devices = {"arm": robot.arm, "camera": robot.camera, "clock": robot.clock, "board": config.board}
         session = Capture(**devices, folder=folder, inspector=inspector)
-        n_before = session.open(now(), _truth(robot))
+        n_before = session.open(now(), twin_truth(robot.truth))
         console.print(
             f"samples go to {folder}" + (f", which has {n_before} already" if n_before else ""), soft_wrap=True
         )
@@ -91,7 +96,14 @@ def capture(config: Config, console: Console, pressed: Callable[[], Key] | None 
             search = BoardSearch(**devices, speed=config.speed)
             search.executor.watchers.append(inspector.log_arm)
             pictures = session.drive(search, config.poses, config.seed)
-        _tell(session, pictures, config.poses, console)
+        try:
+            _tell(session, pictures, config.poses, console)
+        except KeyboardInterrupt:
+            n = len(session.taken)
+            console.print(
+                f"{n} of {config.poses} samples are kept; `--out {folder}` goes on from there", soft_wrap=True
+            )
+            raise
     return folder, len(session.taken)
 
 
@@ -115,12 +127,13 @@ def terminal_key() -> Key:
     return "end" if not line or line.strip().lower().startswith("q") else "take"
 
 
-def _truth(robot: CalibrationRobot) -> dict | None:
-    if robot.truth is None:
+def twin_truth(truth: Callable[[], Truth] | None) -> dict | None:
+    """Return what a session keeps of the twin's truth; None where nobody knows it."""
+    if truth is None:
         return None
-    truth = robot.truth()
-    assert truth.T_base_board is not None
-    return {"T_mount_camera": truth.T_flange_camera.tolist(), "T_anchor_board": truth.T_base_board.tolist()}
+    poses = truth()
+    assert poses.T_base_board is not None
+    return {"T_mount_camera": poses.T_flange_camera.tolist(), "T_anchor_board": poses.T_base_board.tolist()}
 
 
 def _tell(session: Capture, pictures: Iterator[Taken], wanted: int, console: Console) -> None:

@@ -75,6 +75,7 @@ class Capture:
         self._arm, self._camera, self._clock = arm, camera, clock
         self._board, self._folder = board, folder
         self._T_flange_camera = T_flange_camera
+        self._tried: list[np.ndarray] = []  # T_base_camera of every picture, the useless ones too
         self._kinematics = Kinematics()
         self._inspector = inspector or Inspector()
 
@@ -103,6 +104,7 @@ class Capture:
             view = detect_board(sample.image, self._board)
             T_base_camera = sample.T_base_flange @ self._T_flange_camera
             self.taken.append(Taken(name=name, view=view, T_base_camera=T_base_camera))
+            self._tried.append(T_base_camera)
         return len(self.taken)
 
     def drive(self, search: BoardSearch, wanted: int, seed: int = 0) -> Iterator[Taken]:
@@ -119,16 +121,15 @@ class Capture:
             As `BoardSearch.find`; and NoViewpointsError: too few views are within reach.
         """
         found = search.find()
-        tried = [taken.T_base_camera for taken in self.taken]
         for round_ in range(_ROUNDS):
             missing = wanted - len(self.taken)
             if missing <= 0:
                 break
-            for view in search.choose(found, missing, taken=tried, seed=seed + round_):
-                tried.append(view.T_base_camera)
+            for view in search.choose(found, missing, taken=self._tried, seed=seed + round_):
                 if search.go(view.q, found.checker):
                     yield self.take()
                 else:
+                    self._tried.append(view.T_base_camera)
                     problem = "one view is left out: there is no free way to it"
                     yield Taken(name="", view=None, T_base_camera=view.T_base_camera, problem=problem)
         search.go_home(found.checker)
@@ -164,6 +165,7 @@ class Capture:
         frame, q = still_frame(self._arm, self._camera, _FRAME_TIMEOUT_S)
         T_base_flange = self._kinematics.flange(q[: z1.N_ARM])
         T_base_camera = T_base_flange @ self._T_flange_camera
+        self._tried.append(T_base_camera)
         self._inspector.log_frame(frame, T_base_camera)
         try:
             view = detect_board(frame.colour, self._board)
@@ -181,8 +183,8 @@ class Capture:
 
     def _is_new(self, q: np.ndarray) -> bool:
         T_base_camera = self._kinematics.flange(q[: z1.N_ARM]) @ self._T_flange_camera
-        for taken in self.taken:
-            distance_m, angle_rad = pose_error(taken.T_base_camera, T_base_camera)
+        for tried in self._tried:
+            distance_m, angle_rad = pose_error(tried, T_base_camera)
             if distance_m < _NEW_M and angle_rad < _NEW_RAD:
                 return False
         return True
