@@ -55,6 +55,23 @@ def split_generator_name(name: str) -> tuple[str, ...]:
     return members
 
 
+def generator_for(weights: Path) -> str:
+    """Return the name of the generator that weights such as these are for.
+
+    Raises:
+        ValueError: they are of none.
+    """
+    if weights.is_dir():
+        return "graspgenx"
+    known = {".yml": "graspgen", ".yaml": "graspgen", ".npz": "diffusion"}
+    if weights.suffix not in known:
+        raise ValueError(
+            f"no grasp generator has weights like {weights}; allowed is a .yml (GraspGen), a folder with gen/ and dis/ "
+            "(GraspGenX), or an .npz of ours."
+        )
+    return known[weights.suffix]
+
+
 def make_generator(name: str, options: GeneratorOptions | None = None) -> GraspGenerator:
     """Return the grasp generator called `name`.
 

@@ -66,7 +66,7 @@ class Config:
     generator: str | None = None
     """Overrides the configuration: which grasp generator, such as `diffusion` or `union:obb_sweep+diffusion`."""
     generator_weights: Path | None = None
-    """Overrides the configuration: the generator's weights, such as a GraspGen checkpoint (.yml)."""
+    """Weights for the generator that has such: GraspGen's .yml, GraspGenX's folder, or an .npz for `diffusion`."""
     config: Path | None = None
     """A YAML file of settings (see `./z1 show-config`)."""
     bus: Annotated[BusConfig, tyro.conf.arg(name="")] = field(default_factory=BusConfig)
@@ -127,7 +127,7 @@ def _assemble(
     """Return the robot, claimed, and what will pick with it; `undo` takes them apart again."""
     from scripts.demo_robot import lockstep_robot, remote_robot
     from z1_runtime.assembly import make_decider
-    from z1_runtime.config import load_config, save_config
+    from z1_runtime.config import load_config, save_config, with_generator
     from z1_runtime.frame_tap import FrameTap
     from z1_runtime.inspect import Inspector
     from z1_runtime.mount import find_mount
@@ -136,10 +136,7 @@ def _assemble(
     runtime = replace(load_config(config.config), seed=config.seed)
     if config.detector is not None:
         runtime = replace(runtime, detector=config.detector)
-    if config.generator is not None:
-        runtime = replace(runtime, generator=config.generator)
-    if config.generator_weights is not None:
-        runtime = replace(runtime, generator_weights=str(config.generator_weights))
+    runtime = with_generator(runtime, config.generator, config.generator_weights)
     save_config(runtime, config.out / "config.yaml")
     mount = find_mount(scene.camera_serial(), config.calibration)
     console.print(f"  {'camera':<9} {mount.origin}", soft_wrap=True)

@@ -29,6 +29,10 @@ class Config:
 
     calibration: Path | None = None
     """A hand-eye result; by default the newest of this camera (see `./z1 calibrate`), else the mount's drawing."""
+    generator: str | None = None
+    """Overrides the configuration: which grasp generator, such as `diffusion` or `union:obb_sweep+diffusion`."""
+    generator_weights: Path | None = None
+    """Weights for the generator that has such: GraspGen's .yml, GraspGenX's folder, or an .npz for `diffusion`."""
     config: Path | None = None
     """A YAML file of settings (see `./z1 show-config`)."""
     out: Path | None = None
@@ -61,13 +65,13 @@ def main(config: Config) -> int:
 def _assemble(config: Config, arm: RemoteArm, camera: RemoteCamera, console: Console, undo: ExitStack) -> PickPipeline:
     """Return what picks; `undo` ends what it writes."""
     from z1_runtime.assembly import make_decider
-    from z1_runtime.config import load_config
+    from z1_runtime.config import load_config, with_generator
     from z1_runtime.frame_tap import FrameTap
     from z1_runtime.inspect import Inspector
     from z1_runtime.mount import find_mount
     from z1_runtime.pipeline import PickPipeline
 
-    runtime = load_config(config.config)
+    runtime = with_generator(load_config(config.config), config.generator, config.generator_weights)
     mount = find_mount(camera.wait_for_frame(runtime.frame_timeout_s).serial, config.calibration)
     console.print(f"  {'camera':<9} {mount.origin}", soft_wrap=True)
     decider = make_decider(runtime, mount.T_flange_camera)

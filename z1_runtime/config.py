@@ -10,7 +10,7 @@ from typing import Any, Literal, TypeVar, get_args
 
 import yaml
 
-from models.generators import Process, split_generator_name
+from models.generators import Process, generator_for, split_generator_name
 from z1_runtime.executor import ExecutorConfig
 from z1_runtime.perception import PerceptionConfig
 from z1_runtime.planner import PlannerConfig
@@ -101,6 +101,20 @@ def load_config(path: Path | None = None) -> RuntimeConfig:
     except yaml.YAMLError as err:
         raise ConfigError(f"the configuration {path} is not YAML: {err}") from err
     return _overlay(RuntimeConfig(), data or {}, str(path))
+
+
+def with_generator(config: RuntimeConfig, generator: str | None, weights: Path | None) -> RuntimeConfig:
+    """Return `config` with what a command line says of the grasp generator; weights alone tell whose they are.
+
+    Raises:
+        ValueError: no generator is called that, or has such weights.
+    """
+    if weights is not None:
+        name = generator_for(weights)
+        if name in split_generator_name(config.generator):
+            name = config.generator  # as it was configured, such as a union
+        config = replace(config, generator=name, generator_weights=str(weights))
+    return config if generator is None else replace(config, generator=generator)
 
 
 def save_config(config: RuntimeConfig, path: Path) -> None:

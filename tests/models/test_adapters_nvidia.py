@@ -12,7 +12,7 @@ from models.adapters.errors import GeneratorError
 from models.adapters.graspgenx import Z1_GRIPPER, sweep_numbers
 from models.adapters.nvidia import NvidiaSampler, make_nvidia_generator
 from models.adapters.torch_patches import compiled_ops_replaced, cuda_only_if_there, drawn_from, fold_attention
-from models.generators import GeneratorOptions, make_generator, split_generator_name
+from models.generators import GeneratorOptions, generator_for, make_generator, split_generator_name
 from z1_runtime import gripper
 
 CLOUD = np.random.default_rng(0).uniform([-0.03, -0.05, 0.38], [0.03, 0.05, 0.42], (500, 3))
@@ -202,6 +202,14 @@ def test_names_and_unions_are_checked():
     for lonely in ("union:obb_sweep", "union:obb_sweep+obb_sweep"):
         with pytest.raises(ValueError, match="two or more different"):
             split_generator_name(lonely)
+
+
+def test_weights_alone_tell_whose_they_are(tmp_path):
+    assert generator_for(tmp_path) == "graspgenx"
+    assert generator_for(tmp_path / "graspgen_franka_panda.yml") == "graspgen"
+    assert generator_for(tmp_path / "mine.npz") == "diffusion"
+    with pytest.raises(ValueError, match="no grasp generator has weights like"):
+        generator_for(tmp_path / "yolov8n.pt")
 
 
 def test_weights_go_to_the_one_member_that_takes_them(tmp_path):

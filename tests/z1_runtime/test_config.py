@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from z1_runtime.config import ConfigError, RuntimeConfig, load_config, save_config
+from z1_runtime.config import ConfigError, RuntimeConfig, load_config, save_config, with_generator
 
 
 def test_without_a_file_the_defaults_are_in_force() -> None:
@@ -64,3 +64,14 @@ def test_a_wrong_file_is_refused_with_the_key(tmp_path: Path, text: str, said: s
 def test_a_missing_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"nowhere\.yaml"):
         load_config(tmp_path / "nowhere.yaml")
+
+
+def test_a_command_line_s_weights_choose_their_generator_unless_one_that_takes_them_is_configured(tmp_path):
+    weights = tmp_path / "graspgen_franka_panda.yml"
+    plain, union = RuntimeConfig(), RuntimeConfig(generator="union:obb_sweep+graspgen")
+    assert with_generator(plain, None, None) == plain
+    assert with_generator(plain, "obb_sweep", None).generator == "obb_sweep"
+    chosen = with_generator(plain, None, weights)
+    assert (chosen.generator, chosen.generator_weights) == ("graspgen", str(weights))
+    assert with_generator(union, None, weights).generator == union.generator
+    assert with_generator(plain, union.generator, weights).generator == union.generator
