@@ -30,16 +30,19 @@ class Phase:
     lr0: float
     """Learning rate after the warm-up."""
     lrf: float
-    """Share of `lr0` at the end; a straight line between."""
+    """Share of `lr0` at the end; a straight line between, in steps of one epoch or, if `smooth`, of one batch."""
     warmup_epochs: float
     batch: int = 8
+    fraction: float = 1.0
+    """Share of the training pictures that it sees, from the first."""
+    smooth: bool = False
 
 
 PHASES = (
     Phase(imgsz=256, epochs=4, lr0=1.0e-3, lrf=0.8, warmup_epochs=0.5),
-    Phase(imgsz=320, epochs=6, lr0=8.0e-4, lrf=0.6, warmup_epochs=0.1),
-    Phase(imgsz=416, epochs=2, lr0=5.0e-4, lrf=0.5, warmup_epochs=0.1),
-    Phase(imgsz=640, epochs=1, lr0=2.5e-4, lrf=0.05, warmup_epochs=0.1),
+    Phase(imgsz=320, epochs=5, lr0=8.0e-4, lrf=0.667, warmup_epochs=0.1),
+    Phase(imgsz=416, epochs=1, lr0=6.0e-4, lrf=0.6, warmup_epochs=0.1, smooth=True),
+    Phase(imgsz=640, epochs=1, lr0=4.0e-4, lrf=0.03, warmup_epochs=0.1, smooth=True, fraction=0.65),
 )
 """Small pictures teach most of it at a fifth of the time; the last phase has the size at which the network is used."""
 
@@ -115,6 +118,9 @@ class Bf16SegmentationModel(SegmentationModel):
 class CpuSegmentationTrainer(SegmentationTrainer):
     """Ultralytics' trainer without validation between epochs, for a network in bfloat16 and channels-last."""
 
+    smooth = False
+    """Whether the learning rate falls with every batch, not with every epoch."""
+
     def get_model(self, cfg=None, weights=None, verbose=True):
         """Return the network, with `weights` if given."""
         model = Bf16SegmentationModel(cfg, nc=self.data["nc"], ch=self.data["channels"], verbose=False)
@@ -135,6 +141,15 @@ class CpuSegmentationTrainer(SegmentationTrainer):
         batch = super().preprocess_batch(batch)
         batch["img"] = batch["img"].contiguous(memory_format=torch.channels_last)
         return batch
+
+    def optimizer_step(self) -> None:
+        """Step, in a smooth phase with the learning rate of this very batch."""
+        super().optimizer_step()
+        batches = len(self.train_loader)
+        self.steps = getattr(self, "steps", self.start_epoch * batches) + 1
+        if self.smooth and self.steps > self._get_warmup_iterations(batches):
+            for group in self.optimizer.param_groups:
+                group["lr"] = group["initial_lr"] * self.lf(self.steps / batches)
 
     def validate(self):
         """Skip: held-out pictures are for the measurement after the training alone."""
@@ -159,6 +174,7 @@ def train_phase(phase: Phase, *, data: Path, folder: Path, start: Path | None, s
     if (folder / "done").exists():
         return last
     settings = asdict(phase) | AUGMENTATION
+    smooth = settings.pop("smooth")
     settings |= {
         "model": f"{ARCHITECTURE}.yaml",
         "data": str(data),
@@ -170,6 +186,7 @@ def train_phase(phase: Phase, *, data: Path, folder: Path, start: Path | None, s
     settings |= {"rect": True, "amp": False, "val": False, "plots": False, "patience": 0, "close_mosaic": 0}
     settings |= {"warmup_bias_lr": 0.0, "deterministic": True, "resume": str(last) if last.exists() else False}
     trainer = CpuSegmentationTrainer(overrides=settings)
+    trainer.smooth = smooth
     trainer.add_callback("on_train_start", lambda _: torch.set_num_threads(threads))
     trainer.train()
     (folder / "done").touch()
