@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from models.detector_weights import INPUT_HW, MAKER, load_detector, tame_ultralytics
+from models.torch_threads import single_threaded_workers
 from models.weights_file import WeightsError, checked_sha256, sha256_of
 
 MODULE_SUFFIXES = (".npz", ".pt")
@@ -67,10 +68,10 @@ def exported(path: Path, folder: Path | None = None) -> Path:
     digest = checked_sha256(path, MAKER) if path.suffix == ".npz" else sha256_of(path)
     target = (folder or cache_folder()) / f"{path.stem}-{digest[:16]}-{_EXPORT}.onnx"
     if not target.is_file():
-        module = load_module(path)
         partial = target.with_name(f".{target.name}.{os.getpid()}")
         try:
-            _export(module, partial)
+            with single_threaded_workers(1, "export") as worker:
+                worker.submit(lambda: _export(load_module(path), partial)).result()
             partial.replace(target)  # nobody ever sees half of it
         finally:
             partial.unlink(missing_ok=True)

@@ -30,6 +30,7 @@ NEEDED: Sequence[Callable[[], Check]] = (
 WELCOME: Sequence[Callable[[], Check]] = (
     checks.check_graphics,
     checks.check_gpu,
+    checks.check_detector,
     checks.check_real_time,
     checks.check_locked_memory,
     checks.check_viewer_port,

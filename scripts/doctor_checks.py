@@ -175,6 +175,46 @@ def check_gpu() -> Check:
     return Check("GPU", State.OK, done.stdout.strip().replace("\n", "; "))
 
 
+def check_detector() -> Check:
+    from models.detector_runtimes import installed_runtimes
+    from models.detector_weights import detector_path
+    from models.weights_file import WeightsError
+
+    able = installed_runtimes()
+    if not able:
+        return Check(
+            "detector", State.WARN, "no runtime", "uv sync --extra fast-detector; until then: --detector tabletop"
+        )
+    try:
+        ms = {runtime: _detector_ms(runtime) for runtime in able}
+    except WeightsError as error:
+        fix = f"restore models/weights/{detector_path().name}; until then: --detector tabletop"
+        return Check("detector", State.WARN, str(error), fix)
+    used, best = able[0], min(ms, key=lambda name: ms[name])
+    seen = ", ".join(f"{name} {ms[name]:.0f} ms" for name in able) + f"; {used} is used"
+    if ms[used] > 1.3 * ms[best]:
+        return Check("detector", State.WARN, seen, f"detector_runtime: {best} in the configuration (--config)")
+    return Check("detector", State.OK, seen)
+
+
+def _detector_ms(runtime: str) -> float:
+    """Return the median time to look at an image of 640 x 480 [ms]."""
+    from statistics import median
+
+    import numpy as np
+
+    from hal.clock import Stopwatch
+    from models.detector import YoloConfig, YoloDetector
+
+    detector, image = YoloDetector(YoloConfig(runtime=runtime)), np.full((480, 640, 3), 127, np.uint8)
+    watch, times = Stopwatch(), []
+    for _ in range(9):
+        watch.lap_ms()
+        detector.detect(image)
+        times.append(watch.lap_ms())
+    return median(times)
+
+
 def check_real_time() -> Check:
     import resource
 

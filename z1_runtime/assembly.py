@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from hal import z1
+from models.detector import YoloConfig, labels_for
 from models.generators import GeneratorOptions, make_generator
 from z1_runtime.config import RuntimeConfig
 from z1_runtime.decision import Decider
@@ -23,15 +24,29 @@ def make_decider(config: RuntimeConfig, T_flange_camera: np.ndarray = z1.T_FLANG
     Args:
         config: which detector, generator, planner, and their numbers.
         T_flange_camera: (4, 4) hand-eye transform.
+
+    Raises:
+        ValueError: a part is unknown, its weights are missing or wrong, or the detector does not know the class.
     """
     kinematics = Kinematics()
+    detector = make_detector(config.detector, _yolo_config(config))
+    if config.object_class and detector.classes:
+        labels_for(config.object_class, detector.classes)  # better refused now than before the object
     return Decider(
         kinematics=kinematics,
-        perception=Perception(config.perception, make_detector(config.detector), T_flange_camera),
+        perception=Perception(config.perception, detector, T_flange_camera),
         generator=make_generator(config.generator, _generator_options(config)),
         planner=GraspPlanner(kinematics, config.planner, MotionLimits.at_speed(config.speed)),
         config=config,
         T_flange_camera=T_flange_camera,
+    )
+
+
+def _yolo_config(config: RuntimeConfig) -> YoloConfig:
+    return YoloConfig(
+        weights=Path(config.detector_weights) if config.detector_weights else None,
+        runtime=config.detector_runtime,
+        min_confidence=config.detector_confidence,
     )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +15,7 @@ from hal.messages import Intrinsics, RgbdFrame
 from models.mvbb import RankedGrasps, fit_obb, rank_grasps
 from models.types import GraspGenerator, GraspSet
 from z1_runtime.config import RuntimeConfig
+from z1_runtime.detectors import TruthDetector
 from z1_runtime.kinematics import Kinematics
 from z1_runtime.perception import Perception, PerceptionError
 from z1_runtime.planner import GraspPlanner, NoPlanError
@@ -92,14 +93,19 @@ class Decider:
         times = StageTimes()
         with times.stage("total"):
             observation = self.observe(frame, q, times)
-            with times.stage("generate"):
-                candidates = self.propose(observation)
-            with times.stage("mvbb"):
-                ranked = self.rank(candidates, observation)
-            plan = self.planner.plan(ranked.grasps, observation, q, times.stage)  # ik, collision, plan
+            candidates, ranked, plan = self._choose(observation, q, times)
         return Decision(
             observation=observation, candidates=candidates, ranked=ranked, plan=plan, stage_ms=dict(times.ms)
         )
+
+    def _choose(
+        self, observation: Observation, q: np.ndarray, times: StageTimes
+    ) -> tuple[GraspSet, RankedGrasps, GraspPlan]:
+        with times.stage("generate"):
+            candidates = self.propose(observation)
+        with times.stage("mvbb"):
+            ranked = self.rank(candidates, observation)
+        return candidates, ranked, self.planner.plan(ranked.grasps, observation, q, times.stage)
 
     def observe(self, frame: RgbdFrame, q: np.ndarray, times: StageTimes | None = None) -> Observation:
         """Return what `frame`, taken at joint positions `q` (7,), shows; `times` gets the stages detect and cloud.
@@ -111,7 +117,7 @@ class Decider:
         jaw = float(q[-1])
         T_base_camera = self.kinematics.flange(q[: z1.N_ARM]) @ self.T_flange_camera
         with times.stage("detect"):
-            detection = self.perception.detect(frame, T_base_camera, jaw)
+            detection = self.perception.detect(frame, T_base_camera, jaw, self.config.object_class or None)
         with times.stage("cloud"):
             return self.perception.segment(frame, T_base_camera, jaw, detection)
 
@@ -145,8 +151,14 @@ class Decider:
     def warm_up(self) -> None:
         """Decide once on a drawn scene, so that the first real frame does not wait for compilers and caches."""
         q = np.append(z1.Q_HOME, self.config.jaw_home)
+        T_base_camera = self.kinematics.flange(z1.Q_HOME) @ self.T_flange_camera
+        frame = draw_can(T_base_camera)
+        (can,) = TruthDetector().detect(frame, T_base_camera)
+        with suppress(PerceptionError):  # who looks at colours sees no can in a black picture, but is warm then
+            self.perception.detect(frame, T_base_camera, self.config.jaw_home)
         try:
-            self.decide(draw_can(self.kinematics.flange(z1.Q_HOME) @ self.T_flange_camera), q)
+            observation = self.perception.segment(frame, T_base_camera, self.config.jaw_home, can)
+            self._choose(observation, q, StageTimes())
         except (PerceptionError, NoPlanError) as error:  # what cannot be done there may be possible here
             _LOG.info("the warm-up scene has no plan under this configuration: %s", error)
 

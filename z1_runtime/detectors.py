@@ -1,15 +1,19 @@
-"""Who finds the object in the image: a contract and two implementations that need no weights."""
+"""Who finds the object in the image: a contract, and three who keep it."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import cv2
 import numpy as np
 
 from hal.messages import RgbdFrame
+from models.detector import YoloConfig
+from models.detector import YoloDetector as ColourDetector
 from models.types import Detection
+from models.weights_file import WeightsError
 from z1_runtime.cloud import (
     PerceptionError,
     back_project,
@@ -28,6 +32,8 @@ class Detector(Protocol):
 
     classes: tuple[str, ...]
     """Labels it can tell apart; empty when it knows no classes."""
+    min_confidence: float
+    """What is not above this does not count; `detect` may return it, to tell what was nearly seen."""
 
     def detect(self, frame: RgbdFrame, T_base_camera: np.ndarray) -> list[Detection]:
         """Return what was found, most confident first; empty when there is nothing.
@@ -52,6 +58,7 @@ class TruthDetector:
     """The twin's own mask, for evaluation: it shows what the rest does when detection is perfect."""
 
     classes: tuple[str, ...] = ()
+    min_confidence: float = 0.0
 
     def detect(self, frame: RgbdFrame, T_base_camera: np.ndarray) -> list[Detection]:
         """Return the one object of the truth mask; see `Detector.detect`."""
@@ -98,6 +105,7 @@ class TabletopDetector:
     """
 
     classes: tuple[str, ...] = ()
+    min_confidence: float = 0.0
 
     def __init__(self, config: TabletopConfig | None = None) -> None:
         self._config = config or TabletopConfig()
@@ -168,15 +176,67 @@ def _is_cut(mask: np.ndarray, depth_m: np.ndarray) -> bool:
     return bool((at_band & mask[rows].any(axis=1)).mean() > 0.05)
 
 
-_DETECTORS: dict[str, type[Detector]] = {"tabletop": TabletopDetector, "truth": TruthDetector}
+class YoloDetector:
+    """What YOLOv8 sees in the colour image, its masks held against the depth."""
+
+    def __init__(self, config: YoloConfig | None = None) -> None:
+        """Load the network; errors as `models.detector.YoloDetector`."""
+        self._detector = ColourDetector(config)
+        self.classes = self._detector.classes
+        self.min_confidence = self._detector.config.min_confidence
+        self.runtime = self._detector.runtime
+
+    def detect(self, frame: RgbdFrame, T_base_camera: np.ndarray) -> list[Detection]:
+        """Return the objects in the colour image, also the faint ones; see `Detector.detect`."""
+        del T_base_camera  # colour alone
+        found = self._detector.detect(frame.colour, min(_FAINT, self.min_confidence))
+        return [_held_against_depth(detection, frame.depth_m) for detection in found]
 
 
-def make_detector(name: str = "tabletop") -> Detector:
-    """Return the detector of that name.
+_FAINT = 0.1
+"""Confidence from which on something is worth a word when nothing better was seen."""
+_EDGE_PX = 4
+"""Masks are a few pixels off at their edge, where what is behind begins."""
+_EDGE_M = 0.010
+"""An edge pixel this much nearer or farther than all inner ones is not of the object [m]."""
+
+
+def _held_against_depth(detection: Detection, depth_m: np.ndarray) -> Detection:
+    """Return `detection` without the pixels at its mask's edge that were measured in front of or behind the object.
+
+    Pixels without depth stay, as in the tabletop's masks: holes belong to what is around them.
+    """
+    mask = detection.mask
+    if mask is None:
+        return detection
+    grown = np.ones((2 * _EDGE_PX + 1,) * 2, np.uint8)
+    inner = cv2.erode(mask.astype(np.uint8), grown, borderType=cv2.BORDER_CONSTANT, borderValue=1).astype(bool)
+    depths = depth_m[inner & (depth_m > 0)]
+    if not len(depths):
+        return detection  # too thin to have an inside
+    nearest, farthest = np.percentile(depths, [1.0, 99.0])
+    outside = (depth_m > 0) & ((depth_m < nearest - _EDGE_M) | (depth_m > farthest + _EDGE_M))
+    return replace(detection, mask=mask & (inner | ~outside))
+
+
+_DETECTORS: dict[str, Callable[[YoloConfig], Detector]] = {
+    "tabletop": lambda _: TabletopDetector(),
+    "truth": lambda _: TruthDetector(),
+    "yolo": YoloDetector,
+}
+DETECTORS = tuple(_DETECTORS)
+"""The detectors by name."""
+
+
+def make_detector(name: str = "tabletop", yolo: YoloConfig | None = None) -> Detector:
+    """Return the detector of that name; `yolo` is for the one that learned.
 
     Raises:
-        ValueError: no such name; the message lists the known ones.
+        ValueError: no such name; the message lists the known ones. Or the learned one's weights are missing or wrong.
     """
     if name not in _DETECTORS:
         raise ValueError(f"there is no detector {name!r}; known: {', '.join(sorted(_DETECTORS))}.")
-    return _DETECTORS[name]()
+    try:
+        return _DETECTORS[name](yolo or YoloConfig())
+    except WeightsError as err:
+        raise WeightsError(f"{err} Without weights: --detector tabletop.") from err

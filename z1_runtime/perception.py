@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Literal
 
 import cv2
 import numpy as np
 
 from hal import z1
 from hal.messages import RgbdFrame
+from models.detector import best_of, labels_for
 from models.types import Detection
 from z1_runtime.cloud import (
     PerceptionError,
@@ -44,6 +46,8 @@ class SmallCloudError(PerceptionError):
 class PerceptionConfig:
     """Limits of the clouds; the paper's values where it gives one."""
 
+    crop: Literal["mask", "box"] = "mask"
+    """What is cut out of the depth: the detection's mask where it has one, or always its box, as in the paper."""
     d_max_m: float = 1.0
     """Depth beyond this is dropped [m]."""
     clip_percent: tuple[float, float] = (1.0, 99.0)
@@ -72,6 +76,8 @@ class PerceptionConfig:
     own: OwnGripper = field(default_factory=OwnGripper)
 
     def __post_init__(self) -> None:
+        if self.crop not in ("mask", "box"):
+            raise ValueError(f"crop is {self.crop!r}; allowed is mask or box.")
         low, high = self.clip_percent
         if not 0.0 <= low < high <= 100.0:
             raise ValueError(
@@ -120,17 +126,23 @@ class Perception:
         Raises:
             NoDepthError: no depth pixel was measured.
             NoDetectionError: nothing (of that class) was found.
+            ValueError: the detector knows classes, and that is none of them.
         """
         _require_depth(frame)
-        found = self._detector.detect(self._without_gripper(frame, jaw), T_base_camera)
-        wanted = [d for d in found if label is None or not self._detector.classes or d.label == label]
-        if not wanted:
-            others = f"; it saw {', '.join(sorted({d.label for d in found}))}" if found else ""
+        detector = self._detector
+        found = detector.detect(self._without_gripper(frame, jaw), T_base_camera)
+        sure = [d for d in found if d.confidence > detector.min_confidence]
+        labels = [d.label for d in sure]
+        if label is not None and detector.classes:
+            labels = labels_for(label, detector.classes)
+        best = best_of(sure, labels)
+        if best is None:
+            instead = _seen_instead(found, detector.min_confidence)
             raise NoDetectionError(
-                f"{type(self._detector).__name__} found no {label or 'object'}{others}. Put the object 0.40 to 0.56 m "
-                "in front of the arm, in view of the wrist camera, and look again."
+                f"{type(detector).__name__} found no {label or 'object'}{instead}. "
+                "Put the object 0.40 to 0.56 m in front of the arm, in view of the wrist camera, and look again."
             )
-        return wanted[0]
+        return best
 
     def segment(self, frame: RgbdFrame, T_base_camera: np.ndarray, jaw: float, detection: Detection) -> Observation:
         """Return the clouds and the table for one detection.
@@ -147,7 +159,9 @@ class Perception:
         """
         _require_depth(frame)
         config, depth = self._config, self._without_gripper(frame, jaw).depth_m
-        crop = detection.mask if detection.mask is not None else box_pixels(depth.shape, detection.box_px)
+        crop = detection.mask if config.crop == "mask" else None
+        if crop is None:
+            crop = box_pixels(depth.shape, detection.box_px)
         rim = cv2.dilate(crop.astype(np.uint8), np.ones((2 * config.rim_px + 1,) * 2, np.uint8)).astype(bool)
         continuous = continuous_pixels(depth)
         seen = valid_pixels(depth, config.d_max_m) & (continuous | crop)
@@ -195,6 +209,14 @@ class Perception:
                 f"stage: {stages}). Move the object closer, or look at it from another side."
             )
         return points[subsample(points, config.max_points)]
+
+
+def _seen_instead(found: list[Detection], min_confidence: float) -> str:
+    """Return the end of a sentence that says what was seen, or nearly."""
+    if not found:
+        return ""
+    seen = ", ".join(f"{d.label} {d.confidence:.2f}" for d in sorted(found, key=lambda d: -d.confidence)[:5])
+    return f"; it saw {seen} (confidence, what counts is above {min_confidence:g})"
 
 
 def _require_depth(frame: RgbdFrame) -> None:

@@ -54,5 +54,5 @@ def test_planner_and_decider_share_one_model_of_the_arm():
 
 
 def test_an_unknown_detector_is_refused_by_name():
-    with pytest.raises(ValueError, match="no detector 'yolo9000'"):
-        make_decider(replace(RuntimeConfig(), detector="yolo9000"))
+    with pytest.raises(ValueError, match="detector is 'yolo9000'; allowed is tabletop or truth or yolo"):
+        replace(RuntimeConfig(), detector="yolo9000")

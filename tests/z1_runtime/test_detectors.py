@@ -1,9 +1,14 @@
 """The classical detector on analytic scenes with a D405's errors, and the contract of all detectors."""
 
+import cv2
 import numpy as np
 import pytest
 from tabletop_scene import INTRINSICS, Box, Cylinder, T_base_camera, cast, d405, frame_of, noisy_frame, truth
 
+from models.detector import YoloConfig
+from models.types import Detection
+from models.weights_file import WeightsError
+from z1_runtime import detectors
 from z1_runtime.cloud import PerceptionError
 from z1_runtime.detectors import TabletopDetector, TruthDetector, make_detector, mask_box
 from z1_runtime.table import NoTableError
@@ -139,5 +144,60 @@ def test_the_truth_detector_names_the_way_out_when_there_is_no_truth():
 def test_detectors_are_made_by_name():
     assert isinstance(make_detector(), TabletopDetector)
     assert isinstance(make_detector("truth"), TruthDetector)
-    with pytest.raises(ValueError, match="no detector 'yolo9000'; known: tabletop, truth"):
+    with pytest.raises(ValueError, match="no detector 'yolo9000'; known: tabletop, truth, yolo"):
         make_detector("yolo9000")
+
+
+class Eye:
+    """In place of the network: sees what it is told, from the confidence it is asked for."""
+
+    classes = ("bottle",)
+    runtime = "none"
+
+    def __init__(self, config):
+        self.config = config or YoloConfig()
+        self.seen = []
+
+    def detect(self, image, min_confidence):
+        assert image.dtype == np.uint8
+        return [d for d in self.seen if d.confidence > min_confidence]
+
+
+@pytest.fixture
+def yolo(monkeypatch):
+    monkeypatch.setattr(detectors, "ColourDetector", Eye)
+    return make_detector("yolo", YoloConfig(min_confidence=0.6))
+
+
+def test_the_learned_detector_reports_also_what_is_faint(yolo):
+    yolo._detector.seen = [Detection(label="bottle", confidence=c, box_px=(0, 0, 9, 9)) for c in (0.9, 0.3, 0.05)]
+    found = yolo.detect(noisy_frame([BOTTLE]), T_base_camera())
+    assert [d.confidence for d in found] == [0.9, 0.3]
+    assert (yolo.classes, yolo.min_confidence) == (("bottle",), 0.6)
+
+
+def test_the_background_at_the_edge_of_a_mask_is_taken_off(yolo):
+    frame = noisy_frame([BOTTLE])
+    true = truth(frame)
+    sloppy = cv2.dilate(true.astype(np.uint8), np.ones((7, 7), np.uint8)).astype(bool)
+    yolo._detector.seen = [Detection(label="bottle", confidence=0.9, box_px=mask_box(sloppy), mask=sloppy)]
+    (found,) = yolo.detect(frame, T_base_camera())
+    extra = sloppy & ~true & (frame.depth_m > 0)
+    assert (found.mask & extra).sum() < 0.6 * extra.sum()
+    assert (found.mask & true).sum() > 0.97 * true.sum()
+    assert (found.mask[sloppy & (frame.depth_m == 0)]).all()  # holes stay
+
+
+def test_a_mask_without_an_inside_or_without_depth_stays_as_it_is(yolo):
+    line = np.zeros((480, 640), bool)
+    line[100:103, 100:300] = True
+    yolo._detector.seen = [Detection(label="bottle", confidence=0.9, box_px=mask_box(line), mask=line)]
+    (found,) = yolo.detect(noisy_frame([BOTTLE]), T_base_camera())
+    assert (found.mask == line).all()
+
+
+def test_missing_weights_of_the_learned_detector_name_the_file_and_what_makes_it(tmp_path):
+    with pytest.raises(
+        WeightsError, match=r"mine\.npz is missing; restore it, .* Without weights: --detector tabletop"
+    ):
+        make_detector("yolo", YoloConfig(weights=tmp_path / "mine.npz"))

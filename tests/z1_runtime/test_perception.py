@@ -36,6 +36,7 @@ class Fixed:
     """Finds what it is told."""
 
     classes = ("bottle", "cup")
+    min_confidence = 0.5
 
     def __init__(self, *detections):
         self._detections = list(detections)
@@ -127,8 +128,36 @@ def test_nothing_on_the_table_is_an_error_that_says_what_to_do():
 
 def test_only_other_classes_is_an_error_that_names_them():
     cup = Detection(label="cup", confidence=0.9, box_px=(0, 0, 10, 10))
-    with pytest.raises(NoDetectionError, match="found no bottle; it saw cup"):
+    with pytest.raises(NoDetectionError, match=r"found no bottle; it saw cup 0\.90"):
         make(Fixed(cup)).detect(noisy_frame([BOTTLE]), T_base_camera(), JAW, "bottle")
+
+
+def test_what_is_too_faint_does_not_count_but_is_named():
+    faint = Detection(label="bottle", confidence=0.31, box_px=(0, 0, 10, 10))
+    with pytest.raises(NoDetectionError, match=r"it saw bottle 0\.31 \(confidence, what counts is above 0\.5\)"):
+        make(Fixed(faint)).detect(noisy_frame([BOTTLE]), T_base_camera(), JAW, "bottle")
+
+
+def test_a_class_that_the_detector_does_not_know_is_refused_with_those_it_knows():
+    with pytest.raises(ValueError, match="does not know 'box'; it knows: bottle, cup"):
+        make(Fixed()).detect(noisy_frame([BOTTLE]), T_base_camera(), JAW, "box")
+
+
+def test_the_crop_may_be_the_box_as_in_the_paper():
+    frame = noisy_frame([BOTTLE])
+    mask = truth(frame).copy()
+    box = mask_box(mask)
+    mask[: (box[1] + box[3]) // 2] = False  # the lower half only
+    half = Fixed(Detection(label="bottle", confidence=0.9, box_px=box, mask=mask))
+    by_mask, by_box = (
+        Perception(PerceptionConfig(crop=crop), half).observe(frame, T_base_camera(), JAW) for crop in ("mask", "box")
+    )
+    assert np.ptp(by_box.object_points[:, 1]) > 1.6 * np.ptp(by_mask.object_points[:, 1])
+
+
+def test_an_unknown_crop_is_refused():
+    with pytest.raises(ValueError, match="crop is 'circle'; allowed is mask or box"):
+        PerceptionConfig(crop="circle")
 
 
 def test_an_empty_depth_image_is_an_error_in_both_steps():
