@@ -1,0 +1,157 @@
+"""Everything a user may tune, in one tree: defaults here, then a YAML file, then the command line."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
+from pathlib import Path
+from typing import Any, Literal, TypeVar, get_args
+
+import yaml
+
+from models.generators import Process, generator_for, split_generator_name
+from z1_runtime.executor import ExecutorConfig
+from z1_runtime.perception import PerceptionConfig
+from z1_runtime.planner import PlannerConfig
+
+T = TypeVar("T")
+
+
+class ConfigError(ValueError):
+    """A configuration file that cannot be used; the message names the key."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RuntimeConfig:
+    """How a pick is done."""
+
+    detector: str = "tabletop"
+    """Which detector: `tabletop` (depth above the table) or `truth` (the twin's mask, for evaluation)."""
+    generator: str = "antipodal"
+    """Which grasp generator: `antipodal`, `obb_sweep` (no learning), `diffusion` (the learned one that ships),
+    `graspgen`, `graspgenx` (NVIDIA's; weights are yours to bring), or `union:a+b` of any of them."""
+    generator_weights: str = ""
+    """Checkpoint of `graspgen` (.yml) or `graspgenx` (folder), or other weights (.npz) of `diffusion`; empty = ours."""
+    generator_process: Process = "in"
+    """Where `graspgen` and `graspgenx` run: `in` the runtime's process, or in their `own`."""
+    generator_python: str = ""
+    """The Python of that process; empty = that of `python -m scripts.make_generator_env`."""
+    n_candidates: int = 800
+    """Grasps the generator proposes (the paper's N)."""
+    seed: int = 0
+    """Seed of the generator."""
+    box_method: Literal["upright", "pca", "min_volume"] = "upright"
+    """How the box is fitted; `pca` is the paper's, `upright` is right where gravity is known."""
+    k_faces: int = 2
+    """How many faces nearest to the camera a grasp may approach (the paper's k)."""
+    alpha: float = 0.85
+    """Weight of the alignment against the generator's score (the paper's α)."""
+    speed: float = 0.5
+    """Fraction of the arm's speed, acceleration and jerk limits that motions use, in (0, 1]."""
+    jaw_home: float = -1.0
+    """Mover angle while looking [rad]; 0 is closed."""
+    jaw_empty: float = -0.03
+    """A mover that closes beyond this angle holds nothing [rad]."""
+    held_torque_nm: float = 1.0
+    """A gripper torque below this holds nothing [Nm]."""
+    hold_s: float = 1.0
+    """How long the lifted object is held before it counts [s]."""
+    frame_timeout_s: float = 5.0
+    """How long to wait for a camera frame [s]."""
+    perception: PerceptionConfig = field(default_factory=PerceptionConfig)
+    """Clouds, filters and the table."""
+    planner: PlannerConfig = field(default_factory=PlannerConfig)
+    """Stand-off, lift, clearances."""
+    executor: ExecutorConfig = field(default_factory=ExecutorConfig)
+    """How trajectories are handed to the servo."""
+
+    def __post_init__(self) -> None:
+        split_generator_name(self.generator)
+        _require(self.generator_process in get_args(Process), "generator_process", self.generator_process, "in or own")
+        _require(1 <= self.n_candidates <= 20_000, "n_candidates", self.n_candidates, "1 to 20000")
+        _require(
+            self.box_method in ("upright", "pca", "min_volume"),
+            "box_method",
+            self.box_method,
+            "upright, pca or min_volume",
+        )
+        _require(1 <= self.k_faces <= 6, "k_faces", self.k_faces, "1 to 6")
+        _require(0.0 <= self.alpha <= 1.0, "alpha", self.alpha, "0 to 1")
+        _require(0.0 < self.speed <= 1.0, "speed", self.speed, "above 0, up to 1")
+        _require(-1.5707 <= self.jaw_home <= 0.0, "jaw_home", self.jaw_home, "-1.5707 (open) to 0 (closed) rad")
+        _require(-1.5707 <= self.jaw_empty <= 0.0, "jaw_empty", self.jaw_empty, "-1.5707 to 0 rad")
+        _require(0.0 <= self.held_torque_nm < 30.0, "held_torque_nm", self.held_torque_nm, "0 to 30 Nm")
+        _require(0.0 <= self.hold_s <= 60.0, "hold_s", self.hold_s, "0 to 60 s")
+        _require(0.0 < self.frame_timeout_s <= 60.0, "frame_timeout_s", self.frame_timeout_s, "above 0, up to 60 s")
+
+
+def load_config(path: Path | None = None) -> RuntimeConfig:
+    """Return the defaults with the values of the YAML file at `path` put over them.
+
+    Raises:
+        ConfigError: the file is missing, is not YAML, or has a key or a value that does not belong there.
+    """
+    if path is None:
+        return RuntimeConfig()
+    try:
+        data = yaml.safe_load(path.read_text())
+    except OSError as err:
+        raise ConfigError(f"the configuration {path} cannot be read: {err.strerror}.") from err
+    except yaml.YAMLError as err:
+        raise ConfigError(f"the configuration {path} is not YAML: {err}") from err
+    return _overlay(RuntimeConfig(), data or {}, str(path))
+
+
+def with_generator(config: RuntimeConfig, generator: str | None, weights: Path | None) -> RuntimeConfig:
+    """Return `config` with what a command line says of the grasp generator; weights alone tell whose they are.
+
+    Raises:
+        ValueError: no generator is called that, or has such weights.
+    """
+    if weights is not None:
+        name = generator_for(weights)
+        if name in split_generator_name(config.generator):
+            name = config.generator  # as it was configured, such as a union
+        config = replace(config, generator=name, generator_weights=str(weights))
+    return config if generator is None else replace(config, generator=generator)
+
+
+def save_config(config: RuntimeConfig, path: Path) -> None:
+    """Write `config` as YAML that `load_config` reads back to an equal one."""
+    path.write_text(yaml.safe_dump(asdict(config), sort_keys=False))
+
+
+def _overlay(default: T, data: Any, where: str) -> T:
+    if not isinstance(data, Mapping):
+        raise ConfigError(f"{where} holds {data!r}; it must hold keys and values.")
+    known = {f.name: getattr(default, f.name) for f in fields(default)}  # type: ignore[arg-type]
+    values = {}
+    for key, value in data.items():
+        if key not in known:
+            near = difflib.get_close_matches(str(key), known, n=1)
+            hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(known)}."
+            raise ConfigError(f"{where} has an unknown key {key!r}; {hint}")
+        values[key] = _converted(known[key], value, f"{where}: {key}")
+    try:
+        return replace(default, **values)  # type: ignore[type-var]
+    except ValueError as err:
+        raise ConfigError(f"{where}: {err}") from err
+
+
+def _converted(old: Any, value: Any, where: str) -> Any:
+    """Return `value` in the type that `old` has."""
+    if is_dataclass(old):
+        return _overlay(old, value, where)
+    if isinstance(old, tuple) and isinstance(value, list) and len(value) == len(old):
+        return tuple(_converted(o, v, where) for o, v in zip(old, value, strict=True))
+    if isinstance(old, float) and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    if type(value) is not type(old):
+        raise ConfigError(f"{where} is {value!r}; it must be a {type(old).__name__}, such as {old!r}.")
+    return value
+
+
+def _require(ok: bool, name: str, seen: object, allowed: str) -> None:
+    if not ok:
+        raise ValueError(f"{name} is {seen}; allowed is {allowed}.")
