@@ -49,6 +49,7 @@ def main(arguments: list[str]) -> int:
     config = tyro.cli(Config, prog="z1 twin run-script", description=__doc__, args=arguments[:end])
     if not config.file.is_file():
         raise ValueError(f"there is no script {config.file}.")
+    import hal.realsense as rs
     from sim_twin.clock import TwinClock
     from sim_twin.realsense_source import TwinSource
     from sim_twin.scene import SceneConfig
@@ -65,20 +66,19 @@ def main(arguments: list[str]) -> int:
     clock: Clock = TwinClock(world) if config.lockstep else WallClock()
     with TwinSource(world, clock) as source, windows_as_files(config.windows, clock, config.frames):
         source.warm_up()
-        return _run(source, config.file, arguments[end:])
+        with rs.plugged(source), rs.masquerade():
+            return run_program(config.file, arguments[end:])
 
 
-def _run(source, file: Path, arguments: list[str]) -> int:
-    import hal.realsense as rs
-
+def run_program(file: Path, arguments: list[str]) -> int:
+    """Run a script as Python would run it, in this process, and return its exit code."""
     sys.argv = [str(file), *arguments]
     sys.path.insert(0, str(file.resolve().parent))
-    with rs.plugged(source), rs.masquerade():
-        try:
-            runpy.run_path(str(file), run_name="__main__")
-        except SystemExit as ended:
-            if ended.code is None or isinstance(ended.code, int):
-                return ended.code or 0
-            print(ended.code, file=sys.stderr)
-            return 1
+    try:
+        runpy.run_path(str(file), run_name="__main__")
+    except SystemExit as ended:
+        if ended.code is None or isinstance(ended.code, int):
+            return ended.code or 0
+        print(ended.code, file=sys.stderr)
+        return 1
     return 0
