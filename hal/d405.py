@@ -170,3 +170,7 @@ class FrameSource(Protocol):
     def reset(self) -> None:
         """The hardware was reset; whatever hung is well again."""
         ...
+
+    def close(self) -> None:
+        """Nobody looks for now: free what the next `expose` can open again."""
+        ...

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from typing import Self
 
 import cv2
 import mujoco
 import numpy as np
 
+from hal.backends.d405_camera import D405Camera
+from hal.backends.d405_session import D405CameraConfig
 from hal.clock import Clock
 from hal.d405 import BASELINE_M, DEPTH_UNIT_M, MIN_Z_M, Calibration, Exposure, Look
 from hal.messages import Intrinsics
@@ -48,8 +51,7 @@ class TwinSource:
         self._snapshot = mujoco.MjData(world.model)
         self._optics: Optics | None = None
         self._renderer: WristRenderer | None = None
-        initializer = None if self.lockstep else give_way
-        self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="twin-d405", initializer=initializer)
+        self._thread: ThreadPoolExecutor | None = None
 
     def expose(self, look: Look) -> Exposure:
         """Return what the imagers see now.
@@ -57,6 +59,9 @@ class TwinSource:
         Raises:
             CameraError: the renderer asked for cannot be had.
         """
+        if self._thread is None:
+            initializer = None if self.lockstep else give_way
+            self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="twin-d405", initializer=initializer)
         return self._thread.submit(self._expose, look).result()
 
     def warm_up(self, width: int = 848, height: int = 480) -> None:
@@ -67,9 +72,11 @@ class TwinSource:
         """Nothing hangs in here."""
 
     def close(self) -> None:
-        """Free the renderer; call it after `unplug`."""
-        self._thread.submit(self._close_renderer).result()
-        self._thread.shutdown()
+        """Free the renderer and its thread until the next `expose`."""
+        thread, self._thread = self._thread, None
+        if thread is not None:
+            thread.submit(self._close_renderer).result()
+            thread.shutdown()
 
     def __enter__(self) -> Self:
         return self
@@ -132,6 +139,18 @@ class TwinSource:
         if not self.world.config.noise:
             return picture
         return d405.measure_colour(np.ascontiguousarray(picture), self.world.config.seed, 3 * look.number + imager)
+
+
+def make_camera(world: World, clock: Clock | None = None, config: D405CameraConfig | None = None) -> D405Camera:
+    """Return the real camera's driver with librealsense and the twin's optics below it, not connected.
+
+    Args:
+        world: what it looks at; it also gives the serial number.
+        clock: a `TwinClock` of that world for lock-step (the default), any other for free run.
+        config: what to stream.
+    """
+    config = replace(config if config is not None else D405CameraConfig(), serial=world.config.camera_serial())
+    return D405Camera(config, source=TwinSource(world, clock))
 
 
 class Optics:

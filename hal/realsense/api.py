@@ -2,7 +2,8 @@
 
 Names and arguments are librealsense's. Facts about the native classes that shape this file: `pipeline.set_device` gives
 a pipeline a device for good and makes it deaf to serial numbers and files in a `config`; a `context` cannot be taught a
-device from Python. The texts of errors are the library's.
+device from Python. The texts of errors are the library's. In lock-step, frames come to those who wait for a pipeline or
+a queue it was started with; callbacks and syncers need free run.
 """
 
 from __future__ import annotations

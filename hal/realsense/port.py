@@ -44,6 +44,7 @@ def unplug(twin: TwinDevice) -> None:
         return
     _twins.remove(twin)
     twin.close()
+    twin.source.close()
     if not _twins:
         rs.device.hardware_reset, rs.options.set_option = _hardware_reset, _set_option
         _watchers.clear()

@@ -164,7 +164,6 @@ def d405_over_the_twin() -> Iterator[CameraCase]:
     camera = CAMERAS.make("d405", config=D405CameraConfig(warm_up_s=0.1), source=source)
     yield CameraCase(camera, source.clock)
     camera.disconnect()
-    source.close()
 
 
 ARM_CASES: list[tuple[str, Callable[[], AbstractContextManager[ArmCase]]]] = [

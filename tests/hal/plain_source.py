@@ -25,7 +25,7 @@ class PlainSource:
         self.calibration = Calibration()
         self.attached = True
         self.looks: list[Look] = []
-        self.resets = 0
+        self.resets = self.closed = 0
         self.hangs = False
         """Gives nothing."""
         self.reset_cures = False
@@ -63,6 +63,9 @@ class PlainSource:
         self.resets += 1
         if self.reset_cures:
             self._cure()
+
+    def close(self) -> None:
+        self.closed += 1
 
     def _cure(self) -> None:
         self.hangs = self.repeats = False

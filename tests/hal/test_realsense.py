@@ -446,12 +446,13 @@ def test_a_hardware_reset_takes_it_off_the_bus_for_a_while(source: PlainSource, 
     pipeline.stop()
 
 
-def test_once_unplugged_a_twin_is_gone_for_good() -> None:
+def test_once_unplugged_a_twin_is_gone_for_good(source: PlainSource) -> None:
     pipeline = rs.pipeline()
-    with rs.plugged(PlainSource()):
+    with rs.plugged(source):
         pipeline.start(wish())
         pipeline.wait_for_frames()
         pipeline.stop()
+    assert source.closed == 1
     assert text_of(lambda: pipeline.start(wish())) == "No device connected"
 
 

@@ -10,11 +10,13 @@ import numpy as np
 import pytest
 from gl_here import needs_egl
 
+from hal.backends.d405_camera import D405Camera
+from hal.backends.d405_session import D405CameraConfig
 from hal.clock import WallClock
 from hal.d405 import BASELINE_M, DEPTH_UNIT_M, MIN_Z_M, Exposure, Look
 from hal.messages import Intrinsics
 from sim_twin.board import BoardSpec
-from sim_twin.realsense_source import Optics, TwinSource
+from sim_twin.realsense_source import Optics, TwinSource, make_camera
 from sim_twin.render import View, make_renderer
 from sim_twin.scene import SceneConfig
 from sim_twin.world import World
@@ -78,14 +80,11 @@ def test_depth_is_exactly_what_its_pinhole_sees(patchwork: World) -> None:
 @needs_egl
 @needs_librealsense
 def test_the_driver_undistorts_colour_onto_depth_to_a_fraction_of_a_pixel(patchwork: World) -> None:
-    from hal.backends.d405_camera import D405Camera
-    from hal.backends.d405_session import D405CameraConfig
-
-    with TwinSource(patchwork) as source:
-        camera = D405Camera(D405CameraConfig(warm_up_s=0.0), source=source)
-        camera.connect()
-        frame = camera.wait_for_frame(1.0)
-        camera.disconnect()
+    camera = make_camera(patchwork, config=D405CameraConfig(warm_up_s=0.0))
+    camera.connect()
+    frame = camera.wait_for_frame(1.0)
+    camera.disconnect()
+    assert frame.serial == patchwork.config.camera_serial()
     corners, wrong = shifts(grey(exact(patchwork, frame.intrinsics).colour), grey(frame.colour))
     assert len(corners) > 150
     assert np.ptp(corners, axis=0) @ [1 / 640, 1 / 480] > 1.7  # all over the picture
@@ -184,9 +183,6 @@ def test_the_same_world_gives_librealsense_the_same_frames() -> None:
 
 @needs_librealsense
 def test_by_the_wall_clock_the_driver_gets_its_frames_too(world: World) -> None:
-    from hal.backends.d405_camera import D405Camera
-    from hal.backends.d405_session import D405CameraConfig
-
     with TwinSource(world, WallClock()) as source:
         source.warm_up(424, 240)
         # However busy the machine is, the camera is given the time.
