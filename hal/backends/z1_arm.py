@@ -16,13 +16,14 @@ from hal import z1
 from hal.backends.z1_client import Z1Client
 from hal.backends.z1_commands import Z1Commands
 from hal.backends.z1_config import Z1ArmConfig, Z1Diagnostics, Z1Mode
-from hal.backends.z1_faults import motor_temperatures
+from hal.backends.z1_faults import motor_values
 from hal.clock import Clock, WallClock
 from hal.errors import CommandRefusedError, HalError, HalTimeoutError, NotConnectedError
 from hal.limits import ServoLimits
 from hal.messages import ArmSetpoint, ArmState
-from hal.wire.controller import TrajectoryCommand
+from hal.wire.controller import ControllerState, TrajectoryCommand
 from hal.wire.link import Link, UdpLink
+from hal.wire.records import JointCommands
 from hal.wire.states import MOVES, Fsm
 
 log = logging.getLogger(__name__)
@@ -41,7 +42,6 @@ _MOVE_TIMEOUT_S = 60.0
 _FSM = {
     Z1Mode.OBSERVE: None,
     Z1Mode.TRACKING: Fsm.JOINTCTRL,
-    Z1Mode.CARTESIAN: Fsm.CARTESIAN,
     Z1Mode.LOW_LEVEL: Fsm.LOWCMD,
 }
 
@@ -160,6 +160,45 @@ class Z1Arm:
             client.send()
             return applied
 
+    def send_motors(self, commands: JointCommands) -> JointCommands:
+        """Command the seven motors directly, in LOW_LEVEL; return what is left after the limits on position, speed
+        and torque (`hal.backends.z1_torque.limit_commands`). Nothing is compensated.
+
+        A torque without stiffness goes on for ever when this process dies: the controller repeats its last command.
+
+        Raises:
+            CommandRefusedError: the arm is in another mode, or does not follow.
+            InvalidMessageError: values that are not finite.
+        """
+        with self._lock:
+            self._connected().receive()
+            client = self._ready()
+            if self._mode is not Z1Mode.LOW_LEVEL:
+                raise CommandRefusedError(f"the arm is in mode {self._mode}; motors are commanded in low_level.")
+            applied = self._commands.follow_motors(commands)
+            client.send()
+            return applied
+
+    def idle(self) -> None:
+        """Take what came and send the last command once more, at rest: what keeps the controller answering."""
+        with self._lock:
+            self._connected().receive()
+            self._hold()
+
+    @property
+    def moving(self) -> bool:
+        """Whether the controller is making a motion that was begun here."""
+        return self._moving
+
+    @property
+    def newest(self) -> ControllerState:
+        """The newest answer, however old.
+
+        Raises:
+            NotConnectedError: before `connect()`.
+        """
+        return self._connected().newest
+
     def stop(self) -> None:
         self._client.cancelled = True  # whoever waits inside, with the lock, gives up
         with self._lock:
@@ -192,6 +231,7 @@ class Z1Arm:
             client = self._connected()
             if client.newest.state in MOVES:
                 client.wait_for(Fsm.JOINTCTRL, self.config.connect_timeout_s)
+            self._moving = False
             if mode is Z1Mode.LOW_LEVEL:
                 self._enter_low_level(client)
             elif mode is Z1Mode.TRACKING and client.newest.state is not Fsm.JOINTCTRL:
@@ -319,8 +359,11 @@ class Z1Arm:
                     raise CommandRefusedError("the motion was stopped before its end.")
                 if state not in MOVES:
                     self._resume()
-                    self._ready()
-                    return
+                    if state is Fsm.JOINTCTRL:
+                        return
+                    raise CommandRefusedError(
+                        f"the motion ended in {state.name} instead of JOINTCTRL; look at the arm."
+                    )
                 client.send()
             if self.clock.now_s() > end_s:
                 raise HalTimeoutError(f"the controller is still in {state.name} after {timeout_s} s; it goes on.")
@@ -340,6 +383,17 @@ class Z1Arm:
         self.begin_move(Fsm.BACKTOSTART)
         self.end_move()
 
+    def calibrate(self) -> None:
+        """Make the present pose the zero of all joints, as the vendor's `calibration` does; ends in PASSIVE.
+
+        Raises:
+            CommandRefusedError, HalTimeoutError: the controller does not.
+        """
+        self.go_passive()
+        with self._lock:
+            self._client.ask(Fsm.CALIBRATION)
+            self._client.wait_for(Fsm.PASSIVE, _MOVE_TIMEOUT_S)
+
     # --- Account ----------------------------------------------------------------------------------------------------
 
     def diagnostics(self) -> Z1Diagnostics:
@@ -354,7 +408,7 @@ class Z1Arm:
             return Z1Diagnostics(
                 fsm=client.newest.state,
                 pose=client.newest.pose,
-                temperatures_c=motor_temperatures(client.newest.joints),
+                temperatures_c=motor_values(client.newest.joints.temperature_c).astype(float),
                 faults=client.faults.latched(),
                 answer_age_s=now_s - client.newest_s,
                 unchanged_s=now_s - client.changed_s,

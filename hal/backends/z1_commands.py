@@ -11,15 +11,11 @@ from hal.backends.z1_torque import FeedForward, limit_commands
 from hal.errors import HalTimeoutError
 from hal.limits import ServoLimits, clip_setpoint
 from hal.messages import ArmSetpoint
-from hal.wire.controller import KD_JOINTCTRL, KD_LOWCMD, KP_LOWCMD, TrajectoryCommand, encode_command
+from hal.wire.controller import KD_JOINTCTRL, KD_LOWCMD, KP_LOWCMD
 from hal.wire.records import JointCommands
 from hal.wire.states import Fsm
 
-POSE_SPEED = np.array([0.6, 0.6, 0.6, 0.3, 0.3, 0.3])
-"""(6,) highest speed of a tracked pose: angles [rad/s], positions [m/s] (the vendor's ranges)."""
-
 _MAX_LEAD_RAD = 0.35  # above the servo's following error, so that the servo is the one to notice and to say so
-_MAX_POSE_LEAD = np.array([0.2, 0.2, 0.2, 0.05, 0.05, 0.05])
 _STALE_S = 0.1
 _STALE_RAD = 0.05
 _STILL_RAD = 0.001
@@ -46,25 +42,19 @@ class Z1Commands:
         self.q_sent = self._still_q = _REST
         """(7,) last position commanded [rad]."""
         self._still_s = 0.0
-        self._pose_sent = np.zeros(6)
 
     def take_over(self, mode: Z1Mode) -> None:
         """Start a mode with the command equal to the measurement."""
-        newest = self._client.newest
         self.mode = mode
-        self.q_sent = self._still_q = newest.joints.q
+        self.q_sent = self._still_q = self._client.newest.joints.q
         self._still_s = self._client.newest_s
-        self._pose_sent = newest.pose
         if mode is Z1Mode.LOW_LEVEL and self._feed_forward is None:
             self._feed_forward = FeedForward()
 
     def hold(self) -> None:
         """Command the last position once more, at rest."""
-        match self.mode:
-            case Z1Mode.CARTESIAN:
-                self._write_pose()
-            case Z1Mode.TRACKING | Z1Mode.LOW_LEVEL:
-                self._write(self.q_sent, _REST)
+        if self.mode is not Z1Mode.OBSERVE:
+            self._write(self.q_sent, _REST)
 
     def follow(self, setpoint: ArmSetpoint) -> ArmSetpoint:
         """Command what is nearest to `setpoint`; return it.
@@ -84,23 +74,15 @@ class Z1Commands:
         return ArmSetpoint(q=q, dq=dq)
 
     def follow_motors(self, wish: JointCommands) -> JointCommands:
-        """Command the motors directly, in low-level mode; return what is left after all limits."""
+        """Command the motors directly, in low-level mode; return what is left after all limits.
+
+        Raises:
+            InvalidMessageError: values that are not finite.
+        """
         allowed = self._limited(wish)
         self._write_motors(allowed)
         self.q_sent = allowed.q
         return allowed
-
-    def follow_pose(self, pose: np.ndarray, gripper_rad: float) -> np.ndarray:
-        """Command a pose (6,) of the pivot, in Cartesian mode; return what is left after one period's step."""
-        step = POSE_SPEED * z1.CONTROL_PERIOD_S
-        wish = np.clip(pose, self._pose_sent - step, self._pose_sent + step)
-        measured = self._client.newest.pose
-        self._pose_sent = np.clip(wish, measured - _MAX_POSE_LEAD, measured + _MAX_POSE_LEAD)
-        q = self.q_sent.copy()
-        q[_GRIPPER] = gripper_rad
-        self.q_sent = clip_setpoint(self._limits, q, _REST, self.q_sent, self._client.newest.joints.q).q
-        self._write_pose()
-        return self._pose_sent
 
     def entry(self) -> JointCommands:
         """Return the first command of the low-level mode: the measurement, at rest."""
@@ -147,11 +129,6 @@ class Z1Commands:
         for name in ("q", "dq", "tau", "kp", "kd"):
             joints[name] = getattr(commands, name)
         self._client.command.head(Fsm.INVALID, track=False)
-
-    def _write_pose(self) -> None:
-        poses = np.array([self._pose_sent, np.zeros(6)])
-        move = TrajectoryCommand(poses=poses, gripper_rad=float(self.q_sent[_GRIPPER]))
-        self._client.command.data[:] = encode_command(Fsm.INVALID, move, track=True)
 
     def _balanced(self, q: np.ndarray, dq: np.ndarray) -> JointCommands:
         """Return the motors' commands for a setpoint: usual gains, gravity and friction compensated."""

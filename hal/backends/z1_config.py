@@ -20,8 +20,6 @@ class Z1Mode(StrEnum):
     """Not at all: it is only looked at."""
     TRACKING = "tracking"
     """JOINTCTRL: the controller's own position servo, with its gravity compensation."""
-    CARTESIAN = "cartesian"
-    """CARTESIAN: the controller's own inverse kinematics."""
     LOW_LEVEL = "low_level"
     """LOWCMD: our gains, gravity and friction compensation straight to the motors."""
 

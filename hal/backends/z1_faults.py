@@ -91,9 +91,9 @@ class FaultLatch:
         self._seen.clear()
 
 
-def motor_temperatures(joints: JointStates) -> np.ndarray:
-    """Return the temperatures (8,) [°C] of joint1, joint2's two motors, joint3 … joint6 and the gripper."""
-    return joints.temperature_c.ravel()[_MOTOR_AT].astype(float)
+def motor_values(values: np.ndarray) -> np.ndarray:
+    """Return, of `values` (7, 2), those (8,) of joint1, joint2's two motors, joint3 … joint6 and the gripper."""
+    return values.ravel()[_MOTOR_AT]
 
 
 def _name(joint: int, motor: int) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from hal import z1
+from hal.errors import InvalidMessageError
 from hal.limits import ServoLimits
 from hal.wire.records import KD_SCALE, KP_SCALE, JointCommands, JointStates
 
@@ -42,10 +43,16 @@ def limit_commands(commands: JointCommands, states: JointStates, limits: ServoLi
     the feed-forward torque then keeps their sum within it. The gripper's limit is its grip torque.
 
     Args:
-        commands: (7,) each, finite.
+        commands: (7,) each.
         states: the newest measurement.
         limits: the limits.
+
+    Raises:
+        InvalidMessageError: values that are not finite.
     """
+    for name in ("q", "dq", "tau", "kp", "kd"):
+        if not np.isfinite(getattr(commands, name)).all():
+            raise InvalidMessageError(f"{name} of the motors is {getattr(commands, name)}; it must be finite.")
     tau_max = limits.tau_max.copy()
     tau_max[z1.N_ARM] = min(tau_max[z1.N_ARM], limits.grip_torque_nm)
     kp, kd = np.maximum(commands.kp, 0.0), np.maximum(commands.kd, 0.0)

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from z1_peer import FakeController, MemoryLink, mangled
+from z1_peer import FakeController, MemoryLink, gripper_model, mangled
 
 from hal import z1
 from hal.backends.z1_arm import Z1Arm
@@ -17,6 +17,7 @@ from hal.clock import ManualClock
 from hal.errors import CommandRefusedError, HalTimeoutError, NotConnectedError
 from hal.messages import ArmSetpoint, ServoMode, TrajectoryChunk
 from hal.servo import Servo
+from hal.unitree_arm_interface.model import homoToPosture
 from hal.wire.controller import LABELS, STATE_SIZE, TrajectoryCommand
 from hal.wire.records import MotorError, MotorLink
 from hal.wire.states import Fsm
@@ -72,6 +73,13 @@ def low() -> Bench:
     made = make_bench(Z1Mode.LOW_LEVEL)
     made.arm.connect()
     return made
+
+
+def turned(bench: Bench) -> TrajectoryCommand:
+    """Return the move that turns joint1 by 2 rad."""
+    q = bench.peer.q[:6] + 2.0 * np.eye(6)[0]
+    posture = homoToPosture(gripper_model().forwardKinematics(q))
+    return TrajectoryCommand(poses=np.array([posture, np.zeros(6)]), gripper_rad=bench.peer.q[6])
 
 
 # --- Connecting -----------------------------------------------------------------------------------------------------
@@ -306,7 +314,7 @@ def test_an_unknown_label_is_refused_and_the_arm_can_still_be_moved(bench: Bench
 
 def test_setpoints_are_refused_during_such_a_motion_and_a_stop_ends_it(bench: Bench) -> None:
     start = bench.peer.q[0]
-    bench.arm.begin_move(Fsm.MOVEJ, TrajectoryCommand(poses=np.array([[0, 0, 2.0, 0, 0, 0], [0] * 6])))
+    bench.arm.begin_move(Fsm.MOVEJ, turned(bench))
     with pytest.raises(CommandRefusedError, match="motion of its own"):
         bench.tick(bench.peer.q.copy())
     bench.arm.stop()
@@ -317,9 +325,16 @@ def test_setpoints_are_refused_during_such_a_motion_and_a_stop_ends_it(bench: Be
     bench.run(bench.peer.q.copy(), 0.1)
 
 
+def test_a_motion_that_ends_elsewhere_is_said(bench: Bench) -> None:
+    bench.arm.begin_move(Fsm.MOVEJ, turned(bench))
+    bench.peer.fsm = Fsm.PASSIVE
+    with pytest.raises(CommandRefusedError, match="ended in PASSIVE instead of JOINTCTRL"):
+        bench.arm.end_move()
+
+
 def test_a_motion_that_takes_too_long_is_said(bench: Bench) -> None:
     bench.peer.stuck = 0
-    bench.arm.begin_move(Fsm.MOVEJ, TrajectoryCommand(poses=np.array([[0, 0, 2.0, 0, 0, 0], [0] * 6])))
+    bench.arm.begin_move(Fsm.MOVEJ, turned(bench))
     with pytest.raises(HalTimeoutError, match=r"still in MOVEJ after 1\.0 s"):
         bench.arm.end_move(1.0)
 

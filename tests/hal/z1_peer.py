@@ -17,6 +17,7 @@ import numpy as np
 from hal import z1
 from hal.backends.z1_torque import FeedForward, motor_torques
 from hal.clock import Clock
+from hal.unitree_arm_interface.model import Z1Model, homoToPosture, postureToHomo
 from hal.wire.controller import (
     KD_PASSIVE,
     LABELS,
@@ -39,6 +40,11 @@ def gravity_model() -> FeedForward:
     return FeedForward()
 
 
+@cache
+def gripper_model() -> Z1Model:
+    return Z1Model.with_gripper()
+
+
 class FakeController:
     """States, transitions and motion of the controller; `handle` is its whole contact with the world."""
 
@@ -54,8 +60,6 @@ class FakeController:
         self._goal: np.ndarray | None = None
         self._moved_s = clock.now_s()
         self._frozen: bytes | None = None
-        self.pose = np.zeros(6)
-        """(6,) of the pivot; never moves."""
         self._told = JointStates(q=self.q)
         self.error = np.zeros((z1.N_JOINTS, 2), dtype=np.uint8)
         """(7, 2) error bits of the motors."""
@@ -108,7 +112,11 @@ class FakeController:
             link=self.link,
         )
         self._told = joints
-        return encode_state(ControllerState(state=self.fsm, joints=joints, pose=self.pose))
+        return encode_state(ControllerState(state=self.fsm, joints=joints, pose=self.pose()))
+
+    def pose(self) -> np.ndarray:
+        """Return roll, pitch, yaw, x, y, z (6,) of the pivot."""
+        return homoToPosture(gripper_model().forwardKinematics(self.q[:6]))
 
     def silence_board(self, silent: bool) -> None:
         """Let the arm board say nothing, or speak again."""
@@ -130,16 +138,18 @@ class FakeController:
             self.highest_torque = np.maximum(self.highest_torque, asked)
 
     def _set_goal(self, command: Command) -> bool:
-        """Where the controller's own motion ends: labels only, MOVEJ turns joint1 by its yaw."""
+        """Where the controller's own motion ends; the way there is a line in joint space, whatever was asked."""
+        self._goal = self.q.copy()
+        if command.state in (Fsm.MOVEJ, Fsm.MOVEL, Fsm.MOVEC):
+            move = command.trajectory()
+            pose = postureToHomo(move.poses[1 if command.state is Fsm.MOVEC else 0])
+            reachable, self._goal[:6] = gripper_model().inverseKinematics(pose, self.q[:6], True)
+            self._goal[6] = move.gripper_rad
+            return reachable
         label = command.label() if command.state is Fsm.TOSTATE else "startFlat"
-        if command.state is Fsm.MOVEJ:
-            self._goal = self.q.copy()
-            self._goal[0] = command.trajectory().poses[0, 2]
-            return True
-        if label not in LABELS:
-            return False
-        self._goal = np.append(LABELS[label], self.q[z1.N_ARM])
-        return True
+        if label in LABELS:
+            self._goal[:6] = LABELS[label]
+        return label in LABELS
 
     def move(self) -> None:
         """Move on to the present."""
