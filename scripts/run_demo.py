@@ -12,7 +12,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 from rich.console import Console
@@ -54,7 +54,11 @@ class Config:
     lockstep: bool = False
     """One process on the twin's own clock: slower to watch, and the same figures for the same seed."""
     detector: str | None = None
-    """Overrides the configuration: `tabletop`, or `truth` for evaluation."""
+    """Overrides the configuration: `tabletop`, `yolo`, or `truth` for evaluation."""
+    detector_weights: Path | None = None
+    """Weights for `yolo`, which it then is: .npz of ours, .pt of ultralytics, .onnx, or OpenVINO's .xml or folder."""
+    crop: Literal["mask", "box"] | None = None
+    """Overrides the configuration: what is cut out of the depth; `box` is the paper's."""
     calibration: Path | None = None
     """A hand-eye result; by default the newest of this camera (see `./z1 calibrate`), else the mount's drawing."""
     mount_error_m: float = 0.0
@@ -127,15 +131,14 @@ def _assemble(
     """Return the robot, claimed, and what will pick with it; `undo` takes them apart again."""
     from scripts.demo_robot import lockstep_robot, remote_robot
     from z1_runtime.assembly import make_decider
-    from z1_runtime.config import load_config, save_config, with_generator
+    from z1_runtime.config import load_config, save_config, with_detector, with_generator
     from z1_runtime.frame_tap import FrameTap
     from z1_runtime.inspect import Inspector
     from z1_runtime.mount import find_mount
     from z1_runtime.pipeline import PickPipeline
 
-    runtime = replace(load_config(config.config), seed=config.seed)
-    if config.detector is not None:
-        runtime = replace(runtime, detector=config.detector)
+    runtime = replace(load_config(config.config), seed=config.seed, object_class=config.object)
+    runtime = with_detector(runtime, config.detector, config.detector_weights, config.crop)
     runtime = with_generator(runtime, config.generator, config.generator_weights)
     save_config(runtime, config.out / "config.yaml")
     mount = find_mount(scene.camera_serial(), config.calibration)

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import logging
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 from rich.console import Console
@@ -29,6 +29,14 @@ class Config:
 
     calibration: Path | None = None
     """A hand-eye result; by default the newest of this camera (see `./z1 calibrate`), else the mount's drawing."""
+    object: str = ""
+    """Class to pick, such as bottle, for a detector that knows classes; empty = the configuration's."""
+    detector: str | None = None
+    """Overrides the configuration: `tabletop` or `yolo`."""
+    detector_weights: Path | None = None
+    """Weights for `yolo`, which it then is: .npz of ours, .pt of ultralytics, .onnx, or OpenVINO's .xml or folder."""
+    crop: Literal["mask", "box"] | None = None
+    """Overrides the configuration: what is cut out of the depth; `box` is the paper's."""
     generator: str | None = None
     """Overrides the configuration: which grasp generator, such as `diffusion` or `union:obb_sweep+diffusion`."""
     generator_weights: Path | None = None
@@ -65,13 +73,16 @@ def main(config: Config) -> int:
 def _assemble(config: Config, arm: RemoteArm, camera: RemoteCamera, console: Console, undo: ExitStack) -> PickPipeline:
     """Return what picks; `undo` ends what it writes."""
     from z1_runtime.assembly import make_decider
-    from z1_runtime.config import load_config, with_generator
+    from z1_runtime.config import load_config, with_detector, with_generator
     from z1_runtime.frame_tap import FrameTap
     from z1_runtime.inspect import Inspector
     from z1_runtime.mount import find_mount
     from z1_runtime.pipeline import PickPipeline
 
-    runtime = with_generator(load_config(config.config), config.generator, config.generator_weights)
+    runtime = with_detector(load_config(config.config), config.detector, config.detector_weights, config.crop)
+    runtime = with_generator(runtime, config.generator, config.generator_weights)
+    if config.object:
+        runtime = replace(runtime, object_class=config.object)
     mount = find_mount(camera.wait_for_frame(runtime.frame_timeout_s).serial, config.calibration)
     console.print(f"  {'camera':<9} {mount.origin}", soft_wrap=True)
     decider = make_decider(runtime, mount.T_flange_camera)

@@ -10,7 +10,9 @@ from typing import Any, Literal, TypeVar, get_args
 
 import yaml
 
+from models.detector_runtimes import RUNTIMES
 from models.generators import Process, generator_for, split_generator_name
+from z1_runtime.detectors import DETECTORS
 from z1_runtime.executor import ExecutorConfig
 from z1_runtime.perception import PerceptionConfig
 from z1_runtime.planner import PlannerConfig
@@ -27,7 +29,16 @@ class RuntimeConfig:
     """How a pick is done."""
 
     detector: str = "tabletop"
-    """Which detector: `tabletop` (depth above the table) or `truth` (the twin's mask, for evaluation)."""
+    """Which detector: `tabletop` (depth above the table), `yolo` (learned), or `truth` (the twin's mask, for
+    evaluation)."""
+    detector_weights: str = ""
+    """Weights of `yolo`: .npz of ours, .pt of ultralytics, .onnx, OpenVINO's .xml or its folder; empty = ours."""
+    detector_runtime: str = "auto"
+    """What runs `yolo`: `openvino`, `onnxruntime`, `torch`, or `auto`, the first of these that is installed."""
+    detector_confidence: float = 0.5
+    """What `yolo` is not surer of than this does not count, in [0, 1)."""
+    object_class: str = ""
+    """The class to pick, for a detector that knows classes; empty = whatever it is surest of."""
     generator: str = "antipodal"
     """Which grasp generator: `antipodal`, `obb_sweep` (no learning), `diffusion` (the learned one that ships),
     `graspgen`, `graspgenx` (NVIDIA's; weights are yours to bring), or `union:a+b` of any of them."""
@@ -67,6 +78,10 @@ class RuntimeConfig:
     """How trajectories are handed to the servo."""
 
     def __post_init__(self) -> None:
+        _require(self.detector in DETECTORS, "detector", repr(self.detector), " or ".join(DETECTORS))
+        runtimes = ("auto", *RUNTIMES)
+        _require(self.detector_runtime in runtimes, "detector_runtime", self.detector_runtime, " or ".join(runtimes))
+        _require(0.0 <= self.detector_confidence < 1.0, "detector_confidence", self.detector_confidence, "0 to below 1")
         split_generator_name(self.generator)
         _require(self.generator_process in get_args(Process), "generator_process", self.generator_process, "in or own")
         _require(1 <= self.n_candidates <= 20_000, "n_candidates", self.n_candidates, "1 to 20000")
@@ -101,6 +116,21 @@ def load_config(path: Path | None = None) -> RuntimeConfig:
     except yaml.YAMLError as err:
         raise ConfigError(f"the configuration {path} is not YAML: {err}") from err
     return _overlay(RuntimeConfig(), data or {}, str(path))
+
+
+def with_detector(
+    config: RuntimeConfig, detector: str | None, weights: Path | None, crop: Literal["mask", "box"] | None
+) -> RuntimeConfig:
+    """Return `config` with what a command line says of the detector; weights without a name are for `yolo`.
+
+    Raises:
+        ValueError: no detector is called that.
+    """
+    if weights is not None:
+        config = replace(config, detector="yolo", detector_weights=str(weights))
+    if detector is not None:
+        config = replace(config, detector=detector)
+    return config if crop is None else replace(config, perception=replace(config.perception, crop=crop))
 
 
 def with_generator(config: RuntimeConfig, generator: str | None, weights: Path | None) -> RuntimeConfig:
