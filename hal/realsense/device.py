@@ -12,8 +12,8 @@ import numpy as np
 
 from hal import d405
 from hal.clock import unix_offset_s
-from hal.d405 import Calibration, Exposure, FrameSource, Look
-from hal.messages import Intrinsics
+from hal.d405 import Exposure, FrameSource, Look
+from hal.realsense.description import FORMATS, describe
 from hal.realsense.library import native as rs
 
 logger = logging.getLogger(__name__)
@@ -21,46 +21,6 @@ logger = logging.getLogger(__name__)
 SERIAL = "000000000405"
 """Of a twin, unless told otherwise: of the right length, and no real unit's."""
 _IDLE_S = 1.0 / 30.0
-
-_PICTURES = {
-    rs.format.rgb8: (3, None),
-    rs.format.bgr8: (3, cv2.COLOR_RGB2BGR),
-    rs.format.rgba8: (4, cv2.COLOR_RGB2RGBA),
-    rs.format.bgra8: (4, cv2.COLOR_RGB2BGRA),
-}
-_FORMATS = {
-    (rs.stream.depth, 0): {rs.format.z16: (2, None)},
-    (rs.stream.color, 0): {**_PICTURES, rs.format.yuyv: (2, cv2.COLOR_RGB2YUV_YUY2)},
-    (rs.stream.infrared, 1): {rs.format.y8: (1, cv2.COLOR_RGB2GRAY)},
-    (rs.stream.infrared, 2): {rs.format.y8: (1, cv2.COLOR_RGB2GRAY)},
-    (rs.stream.infrared, 0): {**_PICTURES, rs.format.uyvy: (2, cv2.COLOR_RGB2YUV_UYVY)},
-}
-"""(stream, index) to format to (bytes a pixel, OpenCV's conversion from RGB)."""
-
-_DEFAULTS = {
-    (848, 480, 30, rs.stream.depth, rs.format.z16),
-    (848, 480, 30, rs.stream.color, rs.format.rgb8),
-}
-"""What streams when nothing is asked for."""
-
-_OPTIONS = {
-    rs.option.exposure: (*d405.EXPOSURE_US, 1),
-    rs.option.gain: (*d405.GAIN, 1),
-    rs.option.enable_auto_exposure: (0, 1, 1, 1),
-    rs.option.brightness: (-64, 64, 0, 1),
-    rs.option.contrast: (0, 100, 50, 1),
-    rs.option.saturation: (0, 100, 64, 1),
-    rs.option.sharpness: (0, 100, 50, 1),
-    rs.option.gamma: (100, 500, 300, 1),
-    rs.option.hue: (-180, 180, 0, 1),
-    rs.option.white_balance: (2800, 6500, 4600, 10),
-    rs.option.enable_auto_white_balance: (0, 1, 1, 1),
-    rs.option.backlight_compensation: (0, 1, 0, 1),
-    rs.option.power_line_frequency: (0, 2, 2, 1),
-    rs.option.visual_preset: (0, 6, 0, 1),
-    rs.option.global_time_enabled: (0, 1, 1, 1),
-}
-"""Lowest, highest, default, step. Exposure, gain and auto-exposure change the twin's pictures; the rest are kept."""
 
 
 class TwinDevice:
@@ -80,11 +40,7 @@ class TwinDevice:
         """Held while frames go into the library; starting and stopping streams holds it too."""
         self.on_presence: Callable[[bool], None] = lambda present: None
         """Called when the device leaves or returns."""
-        self._sensor = self.handle.add_sensor(d405.SENSOR)
-        _register_identity(self.handle, serial)
-        _add_options(self._sensor)
-        _add_profiles(self._sensor, source)
-        self.handle.create_matcher(rs.matchers.default)
+        self._sensor = describe(self.handle, serial, source.calibration)
         self._first_s: float | None = None
         self._streams: list[tuple] = []
         self._away_until_s = -math.inf
@@ -214,7 +170,7 @@ class TwinDevice:
 
     def _inject(self, profile, exposure: Exposure) -> None:
         stream, index = profile.stream_type(), profile.stream_index()
-        bytes_per_pixel, conversion = _FORMATS[stream, index][profile.format()]
+        bytes_per_pixel, conversion = FORMATS[stream, index][profile.format()]
         size = (profile.height(), profile.width())
         if stream == rs.stream.depth:
             name, shape, dtype = "depth", size, np.uint16
@@ -251,69 +207,3 @@ def _checked(image: np.ndarray, shape: tuple[int, ...], dtype: type, name: str) 
         seen, wanted = f"{image.dtype} {image.shape}", f"{np.dtype(dtype).name} {shape}"
         raise ValueError(f"the frame source gave {seen} for {name}; wanted is {wanted}.")
     return np.ascontiguousarray(image)
-
-
-def _register_identity(handle, serial: str) -> None:
-    info = rs.camera_info
-    for key, value in {
-        info.name: d405.NAME,
-        info.serial_number: serial,
-        info.asic_serial_number: serial,
-        info.firmware_update_id: serial,
-        info.firmware_version: d405.FIRMWARE,
-        info.recommended_firmware_version: d405.FIRMWARE,
-        info.physical_port: f"twin/{serial}",
-        info.product_id: d405.USB_PRODUCT,
-        info.product_line: d405.PRODUCT_LINE,
-        info.usb_type_descriptor: "3.2",
-        info.camera_locked: "YES",
-    }.items():
-        handle.register_info(key, value)
-
-
-def _add_options(sensor) -> None:
-    for option, (lowest, highest, default, step) in _OPTIONS.items():
-        limits = rs.option_range()  # its constructor takes step and default the wrong way round
-        limits.min, limits.max, limits.step, limits.default = lowest, highest, step, default
-        sensor.add_option(option, limits, True)
-    sensor.add_read_only_option(rs.option.depth_units, d405.DEPTH_UNIT_M)
-    sensor.add_read_only_option(rs.option.stereo_baseline, 1e3 * d405.BASELINE_M)  # librealsense: in millimetres
-
-
-def _add_profiles(sensor, source: FrameSource) -> None:
-    """Add every profile of the D405; a request that leaves something open takes the first that fits."""
-    added: dict[tuple, list] = {key: [] for key in _FORMATS}
-    for width, height in d405.MIN_Z_M:
-        rectified = _optics(source.calibration.depth(width, height), rs.distortion.brown_conrady, (0.0,) * 5)
-        raw = source.calibration.colour(width, height), source.calibration.colour_coeffs
-        unrectified = _optics(raw[0], rs.distortion.inverse_brown_conrady, raw[1])
-        for rate_hz in d405.rates_hz(width, height):
-            for uid, ((stream, index), formats) in enumerate(_FORMATS.items(), start=1):
-                for format_, (bytes_per_pixel, _) in formats.items():
-                    video = rs.video_stream()
-                    video.type, video.index, video.uid, video.fmt = stream, index, uid, format_
-                    video.width, video.height, video.fps, video.bpp = width, height, rate_hz, bytes_per_pixel
-                    video.intrinsics = unrectified if stream == rs.stream.color else rectified
-                    is_default = (width, height, rate_hz, stream, format_) in _DEFAULTS
-                    added[stream, index].append(sensor.add_video_stream(video, is_default))
-    _register_extrinsics(added, source.calibration)
-
-
-def _optics(pinhole: Intrinsics, model, coeffs: tuple[float, ...]):
-    optics = rs.intrinsics()
-    optics.width, optics.height = pinhole.width, pinhole.height
-    optics.fx, optics.fy, optics.ppx, optics.ppy = pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy
-    optics.model, optics.coeffs = model, list(coeffs)
-    return optics
-
-
-def _register_extrinsics(added: dict[tuple, list], calibration: Calibration) -> None:
-    first = added[rs.stream.depth, 0][0]
-    for (stream, index), profiles in added.items():
-        pose = rs.extrinsics()  # of the depth axes seen from the stream's
-        rotation = calibration.R_colour_depth if stream == rs.stream.color else np.eye(3)
-        pose.rotation = rotation.ravel(order="F").tolist()
-        pose.translation = [-d405.BASELINE_M if index == 2 else 0.0, 0.0, 0.0]
-        for profile in profiles:
-            if profile is not first:
-                first.register_extrinsics_to(profile, pose)
