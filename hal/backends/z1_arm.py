@@ -224,7 +224,8 @@ class Z1Arm:
         given back to JOINTCTRL.
 
         Raises:
-            CommandRefusedError: the controller does not go there, or the arm does not hold still.
+            CommandRefusedError: the controller does not go there, or the arm does not hold still; it is only observed
+                then.
             HalTimeoutError: it stopped answering.
         """
         with self._lock:
@@ -232,6 +233,7 @@ class Z1Arm:
             if client.newest.state in MOVES:
                 client.wait_for(Fsm.JOINTCTRL, self.config.connect_timeout_s)
             self._moving = False
+            self._mode = self._commands.mode = Z1Mode.OBSERVE
             if mode is Z1Mode.LOW_LEVEL:
                 self._enter_low_level(client)
             elif mode is Z1Mode.TRACKING and client.newest.state is not Fsm.JOINTCTRL:
@@ -252,7 +254,6 @@ class Z1Arm:
             self._mode = self._commands.mode = Z1Mode.OBSERVE
 
     def _enter_low_level(self, client: Z1Client) -> None:
-
         def speed() -> float:
             return float(np.abs(client.newest.joints.dq[: z1.N_ARM]).max())
 
@@ -265,11 +266,13 @@ class Z1Arm:
         was = client.newest.state
         if was is Fsm.LOWCMD:
             return
-        client.ask(Fsm.PASSIVE)
         try:
+            client.ask(Fsm.PASSIVE, timeout_s=_ENTRY_S)
             client.ask(Fsm.LOWCMD, self._commands.entry(), timeout_s=_ENTRY_S)
         except HalError:
+            self._commands.mode = Z1Mode.OBSERVE
             if was is not Fsm.PASSIVE:
+                client.cancelled = False  # a stop, too, wants an arm that does not sink
                 client.ask(Fsm.JOINTCTRL)
             raise
 

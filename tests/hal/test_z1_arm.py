@@ -18,7 +18,7 @@ from hal.errors import CommandRefusedError, HalTimeoutError, NotConnectedError
 from hal.messages import ArmSetpoint, ServoMode, TrajectoryChunk
 from hal.servo import Servo
 from hal.unitree_arm_interface.model import homoToPosture
-from hal.wire.controller import LABELS, STATE_SIZE, TrajectoryCommand
+from hal.wire.controller import COMMAND_SIZE, LABELS, STATE_SIZE, TrajectoryCommand
 from hal.wire.records import MotorError, MotorLink
 from hal.wire.states import Fsm
 
@@ -249,6 +249,22 @@ def test_an_arm_that_lowcmd_does_not_take_is_caught_by_jointctrl(bench: Bench) -
         bench.arm.enter(Z1Mode.LOW_LEVEL)
     assert bench.peer.fsm is Fsm.JOINTCTRL
     assert np.abs(bench.peer.q - before).max() < 0.1
+
+
+def test_a_stop_on_the_way_to_lowcmd_does_not_let_the_arm_sink(bench: Bench) -> None:
+    def stop_on_the_way(data: bytes) -> list[bytes]:
+        if len(data) == COMMAND_SIZE and data[2] == Fsm.LOWCMD:
+            bench.arm._client.cancelled = True  # what `stop` sets first, in another thread
+            return []
+        return [data]
+
+    bench.link.mangle = stop_on_the_way
+    before = bench.peer.q.copy()
+    with pytest.raises(CommandRefusedError, match="a stop came in between"):
+        bench.arm.enter(Z1Mode.LOW_LEVEL)
+    assert bench.peer.fsm is Fsm.JOINTCTRL
+    assert np.abs(bench.peer.q - before).max() < 0.02
+    assert bench.arm.mode is Z1Mode.OBSERVE
 
 
 def test_an_arm_that_does_not_hold_is_given_back(bench: Bench) -> None:
