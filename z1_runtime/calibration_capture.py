@@ -101,10 +101,13 @@ class Capture:
         open_session(self._folder, session)
         loaded = load_samples(self._folder)
         for name, sample in zip(loaded.names, loaded.samples, strict=True):
-            view = detect_board(sample.image, self._board)
             T_base_camera = sample.T_base_flange @ self._T_flange_camera
-            self.taken.append(Taken(name=name, view=view, T_base_camera=T_base_camera))
             self._tried.append(T_base_camera)
+            try:
+                view = detect_board(sample.image, self._board)
+            except CalibrationError:  # left for the solver to tell, and made up for
+                continue
+            self.taken.append(Taken(name=name, view=view, T_base_camera=T_base_camera))
         return len(self.taken)
 
     def drive(self, search: BoardSearch, wanted: int, seed: int = 0) -> Iterator[Taken]:
