@@ -123,7 +123,7 @@ class CpuSegmentationTrainer(SegmentationTrainer):
 
     def get_model(self, cfg=None, weights=None, verbose=True):
         """Return the network, with `weights` if given."""
-        model = Bf16SegmentationModel(cfg, nc=self.data["nc"], ch=self.data["channels"], verbose=False)
+        model = Bf16SegmentationModel(cfg or f"{ARCHITECTURE}.yaml", nc=self.data["nc"], ch=self.data["channels"], verbose=False)
         model = self.set_model_names_for_load(model)
         if weights:
             model.load(weights)
@@ -148,6 +148,7 @@ class CpuSegmentationTrainer(SegmentationTrainer):
         batches = len(self.train_loader)
         self.steps = getattr(self, "steps", self.start_epoch * batches) + 1
         if self.smooth and self.steps > self._get_warmup_iterations(batches):
+            assert self.optimizer is not None and self.lf is not None
             for group in self.optimizer.param_groups:
                 group["lr"] = group["initial_lr"] * self.lf(self.steps / batches)
 
