@@ -90,9 +90,14 @@ class Motion:
         q, dq, self._chase_ddq = self._chaser.step(q, self.q, self._dq, self._ddq)
         return q, dq
 
+    def find_rest(self) -> np.ndarray:
+        """Return where (7,) the joints would come to rest if they braked from the present command [rad]."""
+        path = self._brake.plan(self.q, self._dq, self._ddq)
+        return path.at(path.duration_s)[0]
+
     def brake(self, reason: str) -> None:
         """Begin to stop from the present command."""
-        self.mode, self.reason, self._blend = ServoMode.BRAKING, reason, None
+        self.mode, self.reason, self._blend, self._chase_ddq = ServoMode.BRAKING, reason, None, None
         self._stop_path, self._since_s = self._brake.plan(self.q, self._dq, self._ddq), 0.0
 
     def rest(self) -> Wish:

@@ -15,10 +15,14 @@ import numpy as np
 
 from hal import playback
 from hal.errors import CommandRefusedError, StoppedError
+from hal.guard import BRAKING_SLACK_M, Guard, find_rest
 from hal.lease import Lease
 from hal.limits import ServoLimits
 from hal.messages import ArmSetpoint, ArmState, ServoMode, TrajectoryChunk
 from hal.z1 import JOINT_NAMES, N_ARM
+
+_CHECK_EVERY_S = 0.01
+"""Time between two postures that the guard looks at [s]."""
 
 
 class Snapshot(NamedTuple):
@@ -53,10 +57,12 @@ class Orders:
     Args:
         limits: what trajectories are checked against.
         lease_timeout_s: see `hal.lease.Lease`.
+        guard: keeps trajectories and setpoints where the arm may be; None = anywhere inside the joint limits.
     """
 
-    def __init__(self, limits: ServoLimits, lease_timeout_s: float | None) -> None:
+    def __init__(self, limits: ServoLimits, lease_timeout_s: float | None, guard: Guard | None = None) -> None:
         self._limits = limits
+        self._guard = guard
         self._lock = Lock()
         self.lease = Lease(lease_timeout_s)
         self.reset()
@@ -135,7 +141,9 @@ class Orders:
             running = self.current
             if running is not None and chunk.trajectory_id == running.trajectory_id:
                 played_s = snapshot.time_s if snapshot.trajectory_id == running.trajectory_id else 0.0
-                self.playback = playback.extend(running, chunk, played_s, self._limits)
+                extended = playback.extend(running, chunk, played_s, self._limits)
+                self._check_space(extended, chunk, snapshot)
+                self.playback = extended
                 return
             newest = max(self.done_id, self.playback.trajectory_id if self.playback else 0)
             if chunk.trajectory_id <= newest:
@@ -144,15 +152,19 @@ class Orders:
                     f"the next one is {newest + 1} or more."
                 )
             self._check_start(chunk, snapshot)
-            self.target, self.playback = None, playback.begin(chunk, self._limits)
+            begun = playback.begin(chunk, self._limits)
+            self._check_space(begun, chunk, snapshot)
+            self.target, self.playback = None, begun
 
-    def send(self, setpoint: ArmSetpoint, owner: str | None, now_s: float) -> None:
+    def send(self, setpoint: ArmSetpoint, owner: str | None, now_s: float, snapshot: Snapshot) -> None:
         """Make `setpoint` the target (errors as `hal.servo.Servo.send`)."""
         with self._lock:
             self._admit(owner, now_s)
             running = self.current
             if running is not None:
                 raise CommandRefusedError(f"trajectory {running.trajectory_id} is playing; let it end or release() it.")
+            if self._guard and (refusal := self._guard.refusal(setpoint.q[None], snapshot.q_sent)):
+                raise CommandRefusedError(f"the setpoint {refusal[1]}.")
             self.target = Target(setpoint, now_s)
             self.beyond += bool(((setpoint.q < self._limits.q_min) | (setpoint.q > self._limits.q_max)).any())
 
@@ -169,6 +181,24 @@ class Orders:
         self.target = None
         if self.playback is not None:
             self.cancelled_id = self.playback.trajectory_id
+
+    def _check_space(self, new: playback.Playback, chunk: TrajectoryChunk, snapshot: Snapshot) -> None:
+        if self._guard is None:
+            return
+        start_s = float(chunk.t_s[0])
+        refusal = self._guard.refusal(new.sampled(start_s, _CHECK_EVERY_S), snapshot.q_sent)
+        if refusal is not None:
+            index, what = refusal
+            raise CommandRefusedError(
+                f"trajectory {chunk.trajectory_id} {what} (t = {start_s + index * _CHECK_EVERY_S:.2f} s)."
+            )
+        # If nothing follows, the arm brakes from the last point: that has to end inside as well.
+        rest = find_rest(self._limits, chunk.q[-1], chunk.dq[-1])
+        refusal = self._guard.refusal(rest[None], snapshot.q_sent, BRAKING_SLACK_M)
+        if refusal is not None:
+            raise CommandRefusedError(
+                f"trajectory {chunk.trajectory_id} {refusal[1]}, if the arm has to brake after t = {new.end_s:.2f} s."
+            )
 
     def _check_start(self, chunk: TrajectoryChunk, snapshot: Snapshot) -> None:
         # A squeezing gripper's command leads its measurement, so there the command counts, before or after limits.

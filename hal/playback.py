@@ -18,6 +18,7 @@ MAX_POINTS = 10_000
 """So much may wait to be played: 20 s at the servo's rate. Checking it must not hold up a stop."""
 _SAME_TIME_S = 1e-6
 _KEEP_S = 0.1
+_ROUGHNESS = 1.05  # cubics through samples of a smooth motion overshoot its acceleration a little
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,6 +56,11 @@ class Playback:
         q = a + u * rise + (h * s * (1 - s)) * ((1 - s) * da - s * db)
         dq = (6 * s * (1 - s) / h) * rise + (1 - s) * (1 - 3 * s) * da + s * (3 * s - 2) * db
         return q, dq
+
+    def sampled(self, start_s: float, spacing_s: float) -> np.ndarray:
+        """Return positions (N, 7) [rad] every `spacing_s` from `start_s` to the end [s]."""
+        times = np.arange(start_s, self.end_s, spacing_s)
+        return np.array([self.at(float(t_s))[0] for t_s in (*times, self.end_s)])
 
 
 def begin(chunk: TrajectoryChunk, limits: ServoLimits) -> Playback:
@@ -126,3 +132,26 @@ def _check_points(trajectory_id: int, t_s: np.ndarray, q: np.ndarray, dq: np.nda
             f"trajectory {trajectory_id} moves {JOINT_NAMES[j]} at {speed[i, j]:.3f} rad/s; allowed is "
             f"{limits.dq_max[j]:.3f} rad/s. Slow it down."
         )
+    if len(t_s) > 1:
+        _check_smoothness(trajectory_id, t_s, q, dq, limits)
+
+
+def _check_smoothness(trajectory_id: int, t_s: np.ndarray, q: np.ndarray, dq: np.ndarray, limits: ServoLimits) -> None:
+    """Refuse accelerations and jerks beyond the limits: of the cubics that `Playback.at` lays through the points."""
+    h = np.diff(t_s)[:, None]
+    slope = np.diff(q, axis=0) / h
+    before = (6.0 * slope - 4.0 * dq[:-1] - 2.0 * dq[1:]) / h
+    after = (2.0 * dq[:-1] + 4.0 * dq[1:] - 6.0 * slope) / h
+    # Between two cubics the acceleration may jump; what such a jump asks of the arm is spread over the two.
+    mean = (np.diff(dq, axis=0)) / h
+    jerk = np.diff(mean, axis=0) / (0.5 * (h[1:] + h[:-1]))
+    for name, values, allowed, unit in (
+        ("accelerates", np.maximum(np.abs(before), np.abs(after)), limits.ddq_max, "rad/s²"),
+        ("jerks", np.abs(jerk), limits.dddq_max, "rad/s³"),
+    ):
+        if len(values) and (values / allowed).max() > _ROUGHNESS:
+            i, j = np.unravel_index(int((values / allowed).argmax()), values.shape)
+            raise CommandRefusedError(
+                f"trajectory {trajectory_id} {name} {JOINT_NAMES[j]} with {values[i, j]:.1f} {unit} (t = {t_s[i]:.3f} "
+                f"s); allowed is {allowed[j]:.1f} {unit}. Slow it down, or smooth it."
+            )

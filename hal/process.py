@@ -12,6 +12,7 @@ from threading import Event, Thread
 from hal.bus.server import HalServer
 from hal.bus.session import BusConfig
 from hal.errors import HalError
+from hal.guard import Guard, Workspace
 from hal.limits import ServoLimits
 from hal.messages import ServoMode
 from hal.rig import Rig
@@ -47,6 +48,7 @@ def serve(
     *,
     on_ready: Callable[[], None] | None = None,
     limits: ServoLimits | None = None,
+    workspace: Workspace | None = None,
     cpu: int | None = None,
 ) -> None:
     """Serve `rig` until `stop_event` is set, then brake, hold and let go of everything.
@@ -57,6 +59,7 @@ def serve(
         stop_event: ends it; `stop_on_signals` ties it to the signals.
         on_ready: called once everything answers; over the link the sign is the answer at `srv/hello`.
         limits: of the servo; None = the Z1's.
+        workspace: where the arm may be; None = above its table.
         cpu: the core for the servo thread; None = any.
 
     Raises:
@@ -65,7 +68,8 @@ def serve(
     """
     if rig.call_every_tick is not None:
         raise ValueError("a lock-step rig has no time of its own to be served by; make it with the wall clock.")
-    servo = Servo(rig.arm, rig.clock, limits, heartbeat_timeout_s=HEARTBEAT_TIMEOUT_S)
+    guard = Guard(workspace)
+    servo = Servo(rig.arm, rig.clock, limits, heartbeat_timeout_s=HEARTBEAT_TIMEOUT_S, guard=guard)
     ticking = ServoThread(servo, rig.clock, cpu=cpu)
     with ExitStack() as undo:  # in reverse order, whatever of it was reached
         servo.connect()

@@ -13,6 +13,7 @@ import numpy as np
 from hal.arm import Arm
 from hal.clock import Clock
 from hal.errors import CommandRefusedError, HalError, HalTimeoutError, NotConnectedError
+from hal.guard import Guard
 from hal.limits import OverloadWatch, ServoLimits, clip_setpoint, find_blocked
 from hal.messages import ArmSetpoint, ArmState, ServoMode, ServoStatus, TrajectoryChunk
 from hal.motion import Motion, Wish
@@ -39,6 +40,7 @@ class Servo:
             lost without the servo; the lease then never lapses.
         lease_timeout_s: with the arm at rest, a lease silent for so long [s] may be claimed by another.
         send_timeout_s: how long a single setpoint is followed [s].
+        guard: keeps the arm above the table, in its workspace and off itself; None leaves the joint limits alone.
     """
 
     def __init__(
@@ -50,6 +52,7 @@ class Servo:
         heartbeat_timeout_s: float | None = None,
         lease_timeout_s: float = 1.0,
         send_timeout_s: float = 0.1,
+        guard: Guard | None = None,
     ) -> None:
         self.arm = arm
         self.clock = clock
@@ -57,7 +60,8 @@ class Servo:
         self.periods = PeriodStatistics()
         self._heartbeat_timeout_s = heartbeat_timeout_s
         self._send_timeout_s = send_timeout_s
-        self._orders = Orders(self.limits, None if heartbeat_timeout_s is None else lease_timeout_s)
+        self._guard = guard
+        self._orders = Orders(self.limits, None if heartbeat_timeout_s is None else lease_timeout_s, guard)
         # Written by the tick.
         self._snapshot: Snapshot | None = None
         self._ticked = False
@@ -183,12 +187,12 @@ class Servo:
 
         Raises:
             NotConnectedError, StoppedError, LeaseError: it was not taken.
-            CommandRefusedError: a trajectory is playing.
+            CommandRefusedError: a trajectory is playing, or the guard forbids the place.
         """
         snapshot = self._connected()
         if not isinstance(setpoint, ArmSetpoint):
             raise CommandRefusedError(f"send() takes an ArmSetpoint, not a {type(setpoint).__name__}.")
-        self._orders.send(setpoint, owner, self.clock.now_s())
+        self._orders.send(setpoint, owner, self.clock.now_s(), snapshot)
         allowed = clip_setpoint(self.limits, setpoint.q, setpoint.dq, snapshot.q_sent, snapshot.state.q)
         return ArmSetpoint(q=allowed.q, dq=allowed.dq)
 
@@ -292,7 +296,7 @@ class Servo:
         elif current is not None:
             return self._follow(current, now_s)
         elif target is not None and now_s - target.stamp_s <= self._send_timeout_s:
-            return motion.chase(target.setpoint.q)
+            return self._chase(target.setpoint.q)
         elif motion.mode is ServoMode.TRACKING:
             motion.brake("" if target else orders.cancel_reason)
             orders.target = None
@@ -313,6 +317,18 @@ class Servo:
         wish = motion.play(current)
         if motion.finished:
             self._orders.finish(current)
+        return wish
+
+    def _chase(self, q_target: np.ndarray) -> Wish:
+        """Move towards a setpoint; brake where going on could no longer be stopped inside the guard's space."""
+        motion = self._motion
+        wish = motion.chase(q_target)
+        if self._guard is not None:
+            ahead = np.array([wish[0], motion.find_rest()])
+            if refusal := self._guard.refusal(ahead, self._q_sent):
+                self._orders.target = None
+                motion.brake(f"the way to the setpoint {refusal[1]}")
+                return motion.rest()
         return wish
 
     def _lateness(self, now_s: float) -> str:

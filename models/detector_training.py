@@ -42,7 +42,9 @@ PHASES = (
     Phase(imgsz=256, epochs=4, lr0=1.0e-3, lrf=0.8, warmup_epochs=0.5),
     Phase(imgsz=320, epochs=5, lr0=8.0e-4, lrf=0.667, warmup_epochs=0.1),
     Phase(imgsz=416, epochs=1, lr0=6.0e-4, lrf=0.6, warmup_epochs=0.1, smooth=True),
-    Phase(imgsz=640, epochs=1, lr0=4.0e-4, lrf=0.03, warmup_epochs=0.1, smooth=True, fraction=0.65),
+    Phase(imgsz=320, epochs=14, lr0=1.2e-3, lrf=0.4, warmup_epochs=0.3, smooth=True),
+    Phase(imgsz=416, epochs=8, lr0=5.0e-4, lrf=0.3, warmup_epochs=0.1, smooth=True),
+    Phase(imgsz=640, epochs=2, lr0=1.5e-4, lrf=0.03, warmup_epochs=0.1, smooth=True),
 )
 """Small pictures teach most of it at a fifth of the time; the last phase has the size at which the network is used."""
 

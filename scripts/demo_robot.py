@@ -11,6 +11,7 @@ from hal.bus.client import RemoteArm, RemoteCamera
 from hal.bus.session import BusConfig
 from hal.camera import Camera
 from hal.clock import Clock, WallClock
+from hal.guard import Guard
 from hal.servo import Servo
 from scripts.hal_process import HalProcess
 from sim_twin.scene import SceneConfig
@@ -37,7 +38,7 @@ def lockstep_robot(scene: SceneConfig) -> Iterator[DemoRobot]:
 
     rig = make_rig(scene, lockstep=True)
     assert rig.call_every_tick is not None
-    servo = Servo(rig.arm, rig.clock)
+    servo = Servo(rig.arm, rig.clock, guard=Guard())
     with ExitStack() as undo:
         servo.connect()
         undo.callback(servo.disconnect)

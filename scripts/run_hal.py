@@ -18,6 +18,7 @@ from typing import Annotated
 import tyro
 
 from hal.bus.session import BusConfig
+from hal.guard import Workspace
 from hal.process import serve, stop_on_signals
 from hal.rig import RIGS, Rig
 
@@ -47,6 +48,10 @@ class Config:
     """Twin: how far it is really turned [°]."""
     mount_seed: int = 0
     """Twin: of the direction of both."""
+    board: bool = False
+    """Twin: a calibration board (`./z1 calibrate board`) lies on the table instead of the object."""
+    workspace: Workspace = field(default_factory=Workspace)
+    """Where the arm may be, whoever commands it."""
     bus: Annotated[BusConfig, tyro.conf.arg(name="")] = field(default_factory=BusConfig)
     """Where to listen."""
     until_stdin_closes: bool = False
@@ -72,7 +77,7 @@ def main(config: Config) -> int:
                 undo.callback(TruthServer(config.bus, rig.world).close)
             print(READY, flush=True)
 
-        serve(rig, config.bus, stop_event, on_ready=ready)
+        serve(rig, config.bus, stop_event, on_ready=ready, workspace=config.workspace)
     return 0
 
 
@@ -85,9 +90,12 @@ def make_rig(config: Config) -> Rig:
     """
     if config.hal != "sim":
         return RIGS.make(config.hal)
+    from calibration.board import Board
+    from scripts.calibration_robot import RobotOptions, make_print
     from sim_twin.scene import SceneConfig
 
     scene = SceneConfig(
+        board=make_print(RobotOptions(), Board()) if config.board else None,
         object=config.object,
         distance_m=config.distance_m,
         lateral_m=config.lateral_m,

@@ -8,9 +8,10 @@ import numpy as np
 from numba import njit
 
 from hal import z1
+from hal.z1_shape import CAPSULES, GRIPPER_OBSTACLES, SELF_PAIRS
 from z1_runtime.gripper import mover_pose
 from z1_runtime.kinematics import Kinematics
-from z1_runtime.robot_model import CAPSULES, GRIPPER_OBSTACLES, SELF_PAIRS, gripper_shape
+from z1_runtime.robot_model import gripper_shape
 from z1_runtime.types import Plane
 
 _TABLE_LINKS = ("link02", "link03", "link04", "link05")

@@ -1,10 +1,9 @@
-"""The robot's shape for collision tests: capsules for the links, surface points for gripper, camera and bracket."""
+"""The wrist's shape for collision tests: surface points of gripper, camera and bracket; for links see `hal.z1_shape`."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
-from typing import NamedTuple
 
 import numpy as np
 
@@ -12,38 +11,6 @@ from hal import z1
 from z1_runtime.gripper import PALM_RADIUS_M
 from z1_runtime.voxels import spread_first
 
-
-class Capsule(NamedTuple):
-    """All points within `radius_m` of a segment, in the frame of `link`."""
-
-    link: str
-    start: tuple[float, float, float]
-    end: tuple[float, float, float]
-    radius_m: float
-
-
-CAPSULES = (
-    Capsule("link00", (0.0, 0.0, 0.0), (0.0, 0.0, 0.020), 0.060),
-    Capsule("link01", (0.0, -0.033, 0.033), (0.0, 0.033, 0.033), 0.040),
-    Capsule("link02", (-0.350, 0.0, 0.0), (0.0, 0.0, 0.0), 0.030),
-    Capsule("link02", (-0.350, -0.028, 0.0), (-0.350, 0.028, 0.0), 0.037),
-    Capsule("link02", (0.0, -0.028, 0.0), (0.0, 0.028, 0.0), 0.037),
-    Capsule("link03", (0.0, -0.010, 0.0), (0.060, -0.010, 0.055), 0.036),
-    Capsule("link03", (0.050, 0.0, 0.055), (0.218, 0.0, 0.055), 0.034),
-    Capsule("link03", (0.218, -0.016, 0.055), (0.218, 0.0, 0.055), 0.036),
-    Capsule("link04", (0.0, 0.0, 0.0), (0.070, 0.0, 0.0), 0.040),
-    Capsule("link05", (0.0, 0.0, 0.0), (0.030, 0.0, 0.0), 0.040),
-)
-"""Fitted to the collision meshes; no mesh point sticks out further than 10 mm (a test measures it)."""
-
-SELF_PAIRS = (
-    ("link03", ("link00", "link01")),
-    ("link04", ("link00", "link01", "link02")),
-    ("link05", ("link00", "link01", "link02")),
-)
-"""Links that can meet; neighbours on the chain always touch."""
-GRIPPER_OBSTACLES = ("link00", "link01", "link02", "link03")
-"""Links that gripper and camera can meet."""
 
 _SPACING_M = 0.0085
 _JAW_SPACING_M = 0.005  # jaws pass the object within millimetres, and its edges must not slip between two points

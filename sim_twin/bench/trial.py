@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from hal.errors import HalError
+from hal.guard import Guard
 from hal.messages import RgbdFrame
 from hal.servo import Servo
 from sim_twin.backends import make_rig
@@ -77,7 +78,7 @@ def robot(scene: SceneConfig) -> Iterator[tuple[Executor, World, Watch]]:
     """Yield what moves a lock-step arm that stands at home, its world, and an observer."""
     rig = make_rig(scene, lockstep=True)
     assert rig.call_every_tick is not None
-    servo, watch = Servo(rig.arm, rig.clock), Watch(rig.world)
+    servo, watch = Servo(rig.arm, rig.clock, guard=Guard()), Watch(rig.world)
     with ExitStack() as undo:
         servo.connect()
         undo.callback(servo.disconnect)
@@ -91,7 +92,7 @@ def look(scene: SceneConfig) -> tuple[RgbdFrame, np.ndarray]:
     """Return the camera's frame from home and the joints (7,) it was taken at [rad]."""
     rig = make_rig(scene, lockstep=True)
     assert rig.call_every_tick is not None
-    servo = Servo(rig.arm, rig.clock)
+    servo = Servo(rig.arm, rig.clock, guard=Guard())
     with ExitStack() as undo:
         servo.connect()
         undo.callback(servo.disconnect)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -19,13 +20,13 @@ STEP = np.array([0.8, 0.4, -0.5, 0.3, 0.3, -0.6, -0.4])
 class Bench:
     """Everything a servo test needs, connected and claimed by "test"."""
 
-    def __init__(self, **servo_options: float | None) -> None:
+    def __init__(self, *, start: np.ndarray = START, **servo_options: Any) -> None:
         self.clock = ManualClock(5.0)
-        self.arm = MockArm(self.clock, q=START)
-        self.servo = Servo(self.arm, self.clock, **servo_options)  # type: ignore[arg-type]
+        self.arm = MockArm(self.clock, q=start)
+        self.servo = Servo(self.arm, self.clock, **servo_options)
         self.servo.connect()
         self.servo.claim("test")
-        self.sent: list[np.ndarray] = [START]
+        self.sent: list[np.ndarray] = [start]
 
     def run(self, duration_s: float, every_tick: Callable[[], None] = lambda: None) -> None:
         for _ in range(round(duration_s / CONTROL_PERIOD_S)):
@@ -79,14 +80,18 @@ def move(
     )
 
 
+RAMP_S = 0.65
+"""How long `cruise` takes to its speed, so that full speed stays within acceleration and jerk [s]."""
+
+
 def cruise(joint: int, speed: float, duration_s: float, start: np.ndarray = START) -> TrajectoryChunk:
-    """One joint from rest to `speed` within its acceleration, then at that speed until the buffer runs dry."""
-    ramp_s = abs(speed) / 7.0
+    """One joint from rest to `speed`, smoothly, then at that speed until the buffer runs dry."""
     t_s = np.arange(0.0, duration_s + 1e-9, 0.01)
     q, dq = np.tile(start, (len(t_s), 1)), np.zeros((len(t_s), N_JOINTS))
-    u = np.clip(t_s / ramp_s, 0, 1)
-    dq[:, joint] = speed * u
-    q[:, joint] += np.where(t_s < ramp_s, speed * t_s * u / 2, speed * (t_s - ramp_s / 2))
+    u = np.clip(t_s / RAMP_S, 0, 1)
+    dq[:, joint] = speed * (1 - np.cos(np.pi * u)) / 2
+    ramped = speed * RAMP_S * (u - np.sin(np.pi * u) / np.pi) / 2
+    q[:, joint] += ramped + speed * np.maximum(t_s - RAMP_S, 0.0)
     return TrajectoryChunk(trajectory_id=1, t_s=t_s, q=q, dq=dq)
 
 

@@ -6,7 +6,7 @@ import logging
 
 import numpy as np
 import pytest
-from servo_bench import ARM, START, STEP, Bench, cruise, move, setpoint
+from servo_bench import ARM, RAMP_S, START, STEP, Bench, cruise, move, setpoint
 
 from hal.arm import ServoedArm
 from hal.errors import CommandRefusedError, HalTimeoutError, LeaseError, StoppedError
@@ -284,8 +284,8 @@ def test_releasing_the_lease_in_motion_brakes() -> None:
 @pytest.mark.parametrize("joint", range(N_ARM))
 def test_braking_from_full_speed_takes_less_than_0_4_s(joint: int) -> None:
     bench = Bench()
-    bench.servo.stream(cruise(joint, [1, 1, -1, 1, 1, -1][joint] * 0.99 * DQ_MAX[joint], 0.5))
-    bench.run(0.5 + 2 * CONTROL_PERIOD_S)
+    bench.servo.stream(cruise(joint, [1, 1, -1, 1, 1, -1][joint] * 0.99 * DQ_MAX[joint], RAMP_S + 0.05))
+    bench.run(RAMP_S + 0.05 + 2 * CONTROL_PERIOD_S)
     assert bench.mode is BRAKING
     assert bench.run_until_at_rest(0.4) < 0.4
     q = bench.commanded()
@@ -308,23 +308,6 @@ def test_braking_stays_within_speed_acceleration_and_jerk() -> None:
     assert (np.abs(acceleration) <= DDQ_MAX[ARM] + 1e-6).all()
     # Sampling a jerk-limited path at 2 ms cannot show more than its jerk; the trajectory before it was smooth.
     assert (np.abs(jerk[3:]) <= bench.servo.limits.dddq_max[ARM] + 1e-3).all()
-
-
-def test_braking_begins_from_the_speed_the_limits_let_through() -> None:
-    bench = Bench()
-    q = np.array([START, START])
-    q[1, 0] += 0.62  # 3.1 rad/s on the whole, half as much again in the middle
-    bench.servo.stream(TrajectoryChunk(trajectory_id=1, t_s=np.array([0.0, 0.2]), q=q, dq=np.zeros((2, 7))))
-    bench.run(0.1)
-    bench.servo.stop()
-    begin = len(bench.sent)
-    bench.run_until_at_rest()
-    at_rest = len(bench.sent)
-    bench.run(0.2)
-    command = bench.commanded()[begin - 2 :, 0]
-    acceleration = np.diff(command, n=2) / CONTROL_PERIOD_S**2
-    assert np.abs(acceleration).max() <= 9.5 * DDQ_MAX[0]
-    assert bench.commanded()[at_rest:] == pytest.approx(np.tile(bench.sent[at_rest - 1], (100, 1)), abs=1e-9)
 
 
 # --- Replacement ----------------------------------------------------------------------------------------------------

@@ -10,10 +10,11 @@ from scipy.spatial.transform import Rotation
 from tabletop_scenes import Q_START, camera_pose, cylinder, frontal, make_observation, wall
 
 from hal import z1
+from hal.z1_shape import CAPSULES
 from z1_runtime.collision import CollisionChecker, CollisionConfig
 from z1_runtime.gripper import BeakGripper
 from z1_runtime.kinematics import Kinematics
-from z1_runtime.robot_model import CAPSULES, gripper_shape
+from z1_runtime.robot_model import gripper_shape
 from z1_runtime.trajectory import joint_move
 from z1_runtime.voxels import SceneIndex
 
