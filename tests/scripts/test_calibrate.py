@@ -166,7 +166,7 @@ def in_a_new_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     ("arguments", "code", "said"),
     [
-        (["board", "--columns=60"], 1, "60"),
+        (["board", "--columns=60"], 1, "180 markers"),
         (["hand-eye", "--samples=missing"], 1, "missing"),
         (["intrinsics", "--samples=missing"], 1, "missing"),
         (["capture", "--board-x-m=2"], 2, "board's x_m is 2.0"),
