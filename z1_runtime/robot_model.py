@@ -1,4 +1,4 @@
-"""The wrist's shape for collision tests: surface points of gripper, camera and bracket; for links see `hal.z1_shape`."""
+"""The wrist's shape for collision tests: surface points of gripper, camera and bracket (links: `hal.z1_shape`)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import numpy as np
 from hal import z1
 from z1_runtime.gripper import PALM_RADIUS_M
 from z1_runtime.voxels import spread_first
-
 
 _SPACING_M = 0.0085
 _JAW_SPACING_M = 0.005  # jaws pass the object within millimetres, and its edges must not slip between two points

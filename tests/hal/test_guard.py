@@ -139,7 +139,7 @@ def test_a_later_chunk_through_the_table_is_refused_and_the_arm_brakes_before_it
 
 def test_a_setpoint_below_the_table_is_refused(guard: Guard) -> None:
     bench = Bench(guard=guard)
-    with pytest.raises(CommandRefusedError, match="the setpoint goes .* below the table"):
+    with pytest.raises(CommandRefusedError, match=r"the setpoint goes .* below the table"):
         bench.servo.send(setpoint(LOW))
 
 
