@@ -6,8 +6,6 @@ producers ask for waits in `hal.orders.Orders`, what the tick tells them is one 
 
 from __future__ import annotations
 
-import logging
-
 import numpy as np
 
 from hal.arm import Arm
@@ -20,11 +18,9 @@ from hal.motion import Motion, Wish
 from hal.orders import Orders, Snapshot
 from hal.periods import PeriodStatistics
 from hal.playback import Playback
+from hal.servo_status import Teller, make_status
 from hal.z1 import N_ARM
 
-log = logging.getLogger(__name__)
-
-_WARN_EVERY_S = 1.0
 _STATE_MAX_AGE_S = 0.2
 
 
@@ -66,10 +62,7 @@ class Servo:
         self._snapshot: Snapshot | None = None
         self._ticked = False
         self._clips = 0
-        # Read and written by whoever asks for the status.
-        self._clips_told = 0
-        self._told_s = -np.inf
-        self._latch_told = ""
+        self._teller = Teller()
 
     # --- Life -----------------------------------------------------------------------------------------------
 
@@ -200,39 +193,8 @@ class Servo:
         """Return the servo's account of its last tick; built on request, so that the tick need not."""
         snapshot = self._connected()
         now_s = self.clock.now_s()
-        self._tell(now_s)
-        p50, p999 = self.periods.summary_ms()
-        current = self._orders.current
-        buffered_s = 0.0
-        if current is not None:
-            played_s = snapshot.time_s if current.trajectory_id == snapshot.trajectory_id else 0.0
-            buffered_s = max(current.end_s - played_s, 0.0)
-        return ServoStatus(
-            stamp_s=snapshot.stamp_s,
-            mode=snapshot.mode,
-            reason=snapshot.reason,
-            owner=self._orders.lease.holder(now_s, at_rest=snapshot.at_rest),
-            trajectory_id=snapshot.trajectory_id,
-            trajectory_time_s=snapshot.time_s,
-            buffered_s=buffered_s,
-            finished=snapshot.finished,
-            q_command=snapshot.q_sent,
-            ticks=self.periods.ticks,
-            overruns=self.periods.overruns,
-            period_ms_p50=p50,
-            period_ms_p999=p999,
-        )
-
-    def _tell(self, now_s: float) -> None:
-        """Log what the tick must not."""
-        latch = self._orders.latch
-        if latch != self._latch_told:
-            self._latch_told = latch
-            log.info("servo: %s", f"stopped: {latch}" if latch else "re-armed")
-        clips = self._clips + self._orders.beyond
-        if clips != self._clips_told and now_s - self._told_s >= _WARN_EVERY_S:
-            log.warning("servo: %d setpoints were clipped to the limits.", clips - self._clips_told)
-            self._clips_told, self._told_s = clips, now_s
+        self._teller.tell(self._orders.latch, self._clips + self._orders.beyond, now_s)
+        return make_status(snapshot, self._orders, self.periods, now_s)
 
     # --- The tick -----------------------------------------------------------------------------------------------
 

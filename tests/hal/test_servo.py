@@ -493,7 +493,7 @@ def test_a_motion_with_a_held_object_starts_from_the_gripper_command(grip: str) 
 
 def test_a_latched_stop_and_its_end_are_told_once_each(caplog: pytest.LogCaptureFixture) -> None:
     bench = Bench()
-    with caplog.at_level(logging.INFO, logger="hal.servo"):
+    with caplog.at_level(logging.INFO, logger="hal"):
         bench.arm.inject_fault("overheat joint 2")
         bench.run(0.1)
         bench.arm.inject_fault()
@@ -508,7 +508,7 @@ def test_clipping_is_told_once_a_second(caplog: pytest.LogCaptureFixture) -> Non
     bench = Bench()
     beyond = START.copy()
     beyond[4] = Q_MAX[4] + 0.5
-    with caplog.at_level(logging.WARNING, logger="hal.servo"):
+    with caplog.at_level(logging.WARNING, logger="hal"):
         bench.run(2.5, lambda: bench.servo.send(setpoint(beyond)) and None)
     assert 2 <= len(caplog.records) <= 3
     assert "clipped" in caplog.text

@@ -1,0 +1,58 @@
+"""What the servo says of itself: its status on request, and the log lines that its tick must not write."""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+
+from hal.messages import ServoStatus
+from hal.orders import Orders, Snapshot
+from hal.periods import PeriodStatistics
+
+log = logging.getLogger(__name__)
+
+_WARN_EVERY_S = 1.0
+
+
+def make_status(snapshot: Snapshot, orders: Orders, periods: PeriodStatistics, now_s: float) -> ServoStatus:
+    """Return the status that the last tick's `snapshot`, the `orders` and the measured `periods` amount to."""
+    p50, p999 = periods.summary_ms()
+    current = orders.current
+    buffered_s = 0.0
+    if current is not None:
+        played_s = snapshot.time_s if current.trajectory_id == snapshot.trajectory_id else 0.0
+        buffered_s = max(current.end_s - played_s, 0.0)
+    return ServoStatus(
+        stamp_s=snapshot.stamp_s,
+        mode=snapshot.mode,
+        reason=snapshot.reason,
+        owner=orders.lease.holder(now_s, at_rest=snapshot.at_rest),
+        trajectory_id=snapshot.trajectory_id,
+        trajectory_time_s=snapshot.time_s,
+        buffered_s=buffered_s,
+        finished=snapshot.finished,
+        q_command=snapshot.q_sent,
+        ticks=periods.ticks,
+        overruns=periods.overruns,
+        period_ms_p50=p50,
+        period_ms_p999=p999,
+    )
+
+
+class Teller:
+    """Logs each latched stop once, and clipped setpoints once a second; called by whoever asks for the status."""
+
+    def __init__(self) -> None:
+        self._latch = ""
+        self._clips = 0
+        self._told_s = -np.inf
+
+    def tell(self, latch: str, clips: int, now_s: float) -> None:
+        """Log what is new: `latch`, why the servo is stopped, and `clips`, how many setpoints were clipped so far."""
+        if latch != self._latch:
+            self._latch = latch
+            log.info("servo: %s", f"stopped: {latch}" if latch else "re-armed")
+        if clips != self._clips and now_s - self._told_s >= _WARN_EVERY_S:
+            log.warning("servo: %d setpoints were clipped to the limits.", clips - self._clips)
+            self._clips, self._told_s = clips, now_s
