@@ -51,10 +51,6 @@ class Config:
     robot: Annotated[RobotOptions, tyro.conf.arg(name="")] = field(default_factory=RobotOptions)
     """Which robot."""
 
-    def __post_init__(self) -> None:
-        if self.poses < 1 or not 0.0 < self.speed <= 1.0:
-            raise ValueError(f"poses is {self.poses}, speed is {self.speed}; allowed are 1 and more, above 0 up to 1.")
-
 
 def main(config: Config) -> int:
     """Capture; 0 when there are as many pictures as wanted."""
@@ -77,6 +73,8 @@ def capture(config: Config, console: Console, pressed: Callable[[], Key] | None 
     from z1_runtime.calibration_capture import Capture
     from z1_runtime.inspect import Inspector
 
+    if config.poses < 1 or not 0.0 < config.speed <= 1.0:
+        raise ValueError(f"poses is {config.poses}, speed is {config.speed}; allowed are 1 and more, above 0 up to 1.")
     folder = config.out or new_folder()
     with ExitStack() as undo:
         inspector = Inspector(folder / "capture.rrd" if config.view else None, live=config.view)
