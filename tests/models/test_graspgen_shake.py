@@ -37,6 +37,15 @@ def test_what_is_heavier_than_friction_bears_is_lost():
     assert not held(BRICK, T, mass_kg=(4.0, 4.0)).any()
 
 
+def test_a_part_given_twice_weighs_once():
+    twice = Solid(family="box", parts=np.repeat(BRICK.parts, 3, axis=0), profiles=np.repeat(BRICK.profiles, 3, axis=0))
+    T = grasp((1, 0, 0), (0, 0, -1), (0.0, 0.0, 0.035))
+    mass = 8 * 0.02 * 0.03 * 0.05
+    for density in (0.7 / mass, 3.0 / mass):  # thrice the former is too heavy
+        once, again = (held(s, T, density_kg_m3=density, mass_kg=(0.01, 10.0)).all() for s in (BRICK, twice))
+        assert once == again == (density < 1.0 / mass)
+
+
 def test_a_wedge_is_squeezed_out_where_friction_is_low():
     outline = [(0.0, 0.0), (0.045, 0.0), (0.010, 0.08), (0.0, 0.08)]
     wedge = Solid(family="cone", **dict(zip(("parts", "profiles"), _turned(outline), strict=True)))
