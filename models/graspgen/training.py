@@ -31,7 +31,7 @@ class TrainingConfig:
     generator_rate: float = 1.5e-3
     views_per_batch: int = 20
     grasps_per_view: int = 72
-    discriminator_iterations: int = 5000
+    discriminator_iterations: int = 4000
     discriminator_rate: float = 1.0e-3
     judging: JudgingConfig = field(default_factory=JudgingConfig)
     seed: int = 0
