@@ -22,7 +22,7 @@ from models.graspgen.solids import BOX, LATHE, Solid, make_part, make_solid
 from models.graspgen.views import ViewConfig, render_view
 from models.types import GraspSet
 from models.weights_file import WEIGHTS_FOLDER
-from sim_twin.objects import OBJECT_NAMES, OBJECTS
+from sim_twin.objects import OBJECTS, PAPER_OBJECTS
 
 _SIZE_PX = 360
 _PAPER, _CLOUD = (255, 255, 255), (150, 150, 150)
@@ -72,14 +72,14 @@ def main(config: Config) -> None:
 
 
 def make_objects() -> dict[str, Solid]:
-    """Return the twin's objects, and some of families that it lacks."""
+    """Return the paper's objects, and some of families that it lacks."""
     rng = np.random.default_rng(7)
     others = ("cup", "l_shape", "mug", "hammer", "goblet")
-    return {name: _as_solid(name) for name in OBJECT_NAMES} | {name: make_shape(name, rng) for name in others}
+    return {name: _as_solid(name) for name in PAPER_OBJECTS} | {name: make_shape(name, rng) for name in others}
 
 
 def _as_solid(name: str) -> Solid:
-    """Return one of the twin's objects."""
+    """Return one of the paper's objects."""
     parts = []
     for part in OBJECTS[name].parts:
         if part.kind == "box":
