@@ -13,6 +13,8 @@ from sim_twin.objects import OBJECTS
 from sim_twin.scene import PHYSICS_PERIOD_S, SceneConfig, build_model
 
 GRIPPER_START_RAD = -1.0
+KP_MOTOR_MAX, KD_MOTOR_MAX = 1e4, 1e3
+"""What a motor's gains are cut to [Nm/rad], [Nm s/rad]: thirteen times the vendor's highest, and more."""
 _SUBSTEPS = round(z1.CONTROL_PERIOD_S / PHYSICS_PERIOD_S)
 _SETTLE_STEPS = 100
 
@@ -21,9 +23,13 @@ class World:
     """Physics behind a lock: one thread steps it, others may take snapshots.
 
     The arm starts at home with the jaws open by 1 rad; the object has settled.
+
+    Args:
+        config: what stands where.
+        q_start: (7,) where the arm starts instead [rad].
     """
 
-    def __init__(self, config: SceneConfig) -> None:
+    def __init__(self, config: SceneConfig, q_start: np.ndarray | None = None) -> None:
         self.config = config
         self.model = build_model(config)
         self.data = mujoco.MjData(self.model)
@@ -31,7 +37,8 @@ class World:
         self._steps = 0
         self._corners = OBJECTS[config.object].corners()
         self._fixture = Fixture(self.model) if config.pitch_deg != 0 else None
-        start = np.append(z1.Q_HOME, GRIPPER_START_RAD)
+        self._gravcomp = self.model.body_gravcomp.copy()
+        start = np.append(z1.Q_HOME, GRIPPER_START_RAD) if q_start is None else q_start
         self.data.qpos[: z1.N_JOINTS] = start
         self.set_command(start, np.zeros(z1.N_JOINTS))
         for _ in range(_SETTLE_STEPS):
@@ -61,7 +68,29 @@ class World:
     def set_command(self, q: np.ndarray, dq: np.ndarray) -> None:
         """Set where the servos pull to: positions (7,) [rad] and velocities (7,) [rad/s]."""
         with self._lock:
+            self._set_servos(z1.KP, z1.KD, self._gravcomp)
             self.data.ctrl[:] = z1.KP * q + z1.KD * dq
+
+    def set_motors(self, q: np.ndarray, dq: np.ndarray, tau: np.ndarray, kp: np.ndarray, kd: np.ndarray) -> None:
+        """Let each motor make tau + kp · (q − q_measured) + kd · (dq − dq_measured), up to its effort limit; nothing
+        carries the arm besides.
+
+        Args:
+            q: (7,) [rad].
+            dq: (7,) [rad/s].
+            tau: (7,) [Nm].
+            kp: (7,) [Nm/rad]; from 0 to `KP_MOTOR_MAX`, beyond which physics would not be stable.
+            kd: (7,) [Nm s/rad]; from 0 to `KD_MOTOR_MAX`.
+        """
+        kp, kd = np.clip(kp, 0.0, KP_MOTOR_MAX), np.clip(kd, 0.0, KD_MOTOR_MAX)
+        with self._lock:
+            self._set_servos(kp, kd, 0.0)
+            self.data.ctrl[:] = tau + kp * q + kd * dq
+
+    def _set_servos(self, kp: np.ndarray, kd: np.ndarray, gravcomp: np.ndarray | float) -> None:
+        self.model.actuator_biasprm[:, 1] = -kp
+        self.model.actuator_biasprm[:, 2] = -kd
+        self.model.body_gravcomp[:] = gravcomp
 
     def read_arm(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return positions [rad], velocities [rad/s] and motor torques [Nm], each (7,)."""
