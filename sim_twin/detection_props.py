@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 import mujoco
 import numpy as np
 
-from sim_twin.objects import OBJECTS, Part, lathe
+from sim_twin.objects import OBJECTS
+from sim_twin.parts import Part, lathe
 from sim_twin.z1_mjcf import GROUP_SCENE
 
 CLASSES = ("bottle", "box", "cylinder")

@@ -2,79 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import mujoco
 import numpy as np
 
+from sim_twin.more_objects import EXTENDED
+from sim_twin.parts import GraspObject, Part, lathe
 from sim_twin.z1_mjcf import BIT_BASE, BIT_HAND, BIT_SCENE, CONTACT_SOLIMP, CONTACT_SOLREF, GROUP_SCENE
 
 OBJECT_BODY = "object"
 
 # Plastic or card on a melamine table: 0.3 to 0.5 in tables of friction. The jaws' rubber outranks it by priority.
 _FRICTION = (0.4, 0.005, 0.0001)
-_SEGMENTS = 48
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Part:
-    """One convex part of an object, in the object's frame: origin at mid-height on the axis, z up along it."""
-
-    kind: str
-    """"cylinder", "box" or "frustum"."""
-    size_m: tuple[float, ...]
-    """Cylinder: radius, half height. Box: three half edges. Frustum: lower radius, upper radius, half height."""
-    z_m: float = 0.0
-    """Height of the part's middle."""
-    mass_kg: float
-    """Share of the object's mass; with the shape it gives the inertia (homogeneous part)."""
-    rgba: tuple[float, float, float, float]
-
-    def corners(self) -> np.ndarray:
-        """Return points (N, 3) [m] whose hull is the part."""
-        if self.kind == "box":
-            signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
-            return signs * np.array(self.size_m) + [0, 0, self.z_m]
-        low, high, half = (self.size_m[0], *self.size_m) if self.kind == "cylinder" else self.size_m
-        angle = np.arange(_SEGMENTS) * 2 * np.pi / _SEGMENTS
-        ring = np.column_stack([np.cos(angle), np.sin(angle)])
-        return np.vstack(
-            [
-                np.column_stack([radius * ring, np.full(_SEGMENTS, z)])
-                for radius, z in ((low, self.z_m - half), (high, self.z_m + half))
-            ]
-        )
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class GraspObject:
-    """A rigid object made of convex parts."""
-
-    height_m: float
-    parts: tuple[Part, ...]
-
-    @property
-    def mass_kg(self) -> float:
-        return sum(part.mass_kg for part in self.parts)
-
-    def corners(self) -> np.ndarray:
-        """Return points (N, 3) [m] in the object's frame that hold every extreme point of it."""
-        return np.vstack([part.corners() for part in self.parts])
-
-
-def lathe(profile: tuple[tuple[float, float], ...], parts: tuple[tuple[float, tuple], ...]) -> tuple[Part, ...]:
-    """Return one part per segment of a profile of (height, radius) [m], heights from the foot.
-
-    Args:
-        profile: corner points, from the foot up.
-        parts: (mass_kg, rgba) of each segment.
-    """
-    middle = profile[-1][0] / 2
-    made = []
-    for (z0, r0), (z1, r1), (mass_kg, rgba) in zip(profile[:-1], profile[1:], parts, strict=True):
-        kind, size = ("cylinder", (r0, (z1 - z0) / 2)) if r0 == r1 else ("frustum", (r0, r1, (z1 - z0) / 2))
-        made.append(Part(kind=kind, size_m=size, z_m=(z0 + z1) / 2 - middle, mass_kg=mass_kg, rgba=rgba))
-    return tuple(made)
 
 
 _BOTTLE_PROFILE = (
@@ -88,7 +26,7 @@ _BOTTLE_PROFILE = (
 )
 _PET, _LABEL, _CAP = (0.42, 0.66, 0.80, 1.0), (0.90, 0.92, 0.95, 1.0), (0.10, 0.28, 0.62, 1.0)
 
-OBJECTS: dict[str, GraspObject] = {
+_PAPER: dict[str, GraspObject] = {
     # A half-litre bottle, half full: 25 g of PET and 275 g of water, which stands 80 mm high (its share of the label's
     # part is spread over that part). The water is taken as frozen in place: at grasping accelerations its free surface
     # moves the centre of mass by a few millimetres.
@@ -111,7 +49,10 @@ OBJECTS: dict[str, GraspObject] = {
         parts=(Part(kind="cylinder", size_m=(0.030, 0.075), mass_kg=0.20, rgba=(0.75, 0.16, 0.16, 1.0)),),
     ),
 }
-OBJECT_NAMES = tuple(sorted(OBJECTS))
+PAPER_OBJECTS, EXTENDED_OBJECTS = tuple(_PAPER), tuple(EXTENDED)
+"""The paper's three, and the further shapes."""
+OBJECTS = _PAPER | EXTENDED
+OBJECT_NAMES = tuple(OBJECTS)
 
 
 def add_object(spec: mujoco.MjSpec, name: str, T_base_object: np.ndarray) -> None:
@@ -133,11 +74,4 @@ def add_object(spec: mujoco.MjSpec, name: str, T_base_object: np.ndarray) -> Non
             solref=CONTACT_SOLREF,
             solimp=CONTACT_SOLIMP,
         )
-        if part.kind == "frustum":
-            mesh = spec.add_mesh(name=f"{OBJECT_BODY}_{number}")
-            mesh.uservert = part.corners().ravel()
-            geom.type, geom.meshname = mujoco.mjtGeom.mjGEOM_MESH, mesh.name
-            continue
-        geom.type = mujoco.mjtGeom.mjGEOM_BOX if part.kind == "box" else mujoco.mjtGeom.mjGEOM_CYLINDER
-        geom.size = [*part.size_m, *([0.0] * (3 - len(part.size_m)))]
-        geom.pos = [0.0, 0.0, part.z_m]
+        part.shape(spec, geom)

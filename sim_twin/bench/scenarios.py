@@ -7,11 +7,11 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from itertools import product
 
-from sim_twin.objects import OBJECT_NAMES
+from sim_twin.objects import EXTENDED_OBJECTS, OBJECT_NAMES, PAPER_OBJECTS
 from sim_twin.scene import SceneConfig
 
-PAPER_OBJECTS = ("bottle", "box", "cylinder")
-"""The paper's objects."""
+OBJECT_SETS = {"paper": PAPER_OBJECTS, "extended": EXTENDED_OBJECTS}
+"""Objects by the name of their set."""
 DISTANCES_M = {"near": 0.40, "mid": 0.48, "far": 0.56}
 """The object's centre from the base along x [m]."""
 LATERALS_M = {"left": 0.15, "centre": 0.0, "right": -0.15}
@@ -75,11 +75,15 @@ class Scenario:
 def grid(
     objects: Sequence[str] = PAPER_OBJECTS, seeds: Sequence[int] = (0,), occlusions: Sequence[float] = (0.0,)
 ) -> list[Scenario]:
-    """Return the 27 poses of each object for each seed and occlusion: 81 for the paper's objects."""
+    """Return the poses of each object for each seed and occlusion.
+
+    The paper's objects have 27 poses each, 81 together; the others stand upright only, in 9.
+    """
     return [
         Scenario(object=name, distance=distance, lateral=lateral, pitch_deg=pitch, seed=seed, occlusion=occlusion)
-        for seed, occlusion, name, pitch, distance, lateral in product(
-            seeds, occlusions, objects, PITCHES_DEG, DISTANCES_M, LATERALS_M
+        for seed, occlusion, name in product(seeds, occlusions, objects)
+        for pitch, distance, lateral in product(
+            PITCHES_DEG if name in PAPER_OBJECTS else (0.0,), DISTANCES_M, LATERALS_M
         )
     ]
 

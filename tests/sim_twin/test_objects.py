@@ -1,13 +1,15 @@
 import numpy as np
 import pytest
 
-from sim_twin.objects import OBJECT_NAMES, OBJECTS
+from sim_twin.objects import EXTENDED_OBJECTS, OBJECT_NAMES, OBJECTS, PAPER_OBJECTS
 from sim_twin.scene import SceneConfig
 from sim_twin.world import World
 
 
-def test_there_are_three_objects() -> None:
-    assert OBJECT_NAMES == ("bottle", "box", "cylinder")
+def test_there_are_the_papers_three_objects_and_at_least_twelve_more() -> None:
+    assert PAPER_OBJECTS == ("bottle", "box", "cylinder")
+    assert len(EXTENDED_OBJECTS) >= 12
+    assert OBJECT_NAMES == PAPER_OBJECTS + EXTENDED_OBJECTS
 
 
 @pytest.mark.parametrize(

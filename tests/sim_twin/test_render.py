@@ -6,7 +6,7 @@ import pytest
 from gl_here import needs_egl
 
 from sim_twin.d405 import INTRINSICS, MIN_Z_M, measure_depth
-from sim_twin.objects import OBJECT_NAMES
+from sim_twin.objects import PAPER_OBJECTS
 from sim_twin.render import View, make_renderer
 from sim_twin.scene import SceneConfig
 from sim_twin.world import World
@@ -21,7 +21,7 @@ def _draw(config: SceneConfig, kind: str) -> View:
 
 
 @needs_egl
-@pytest.mark.parametrize("name", OBJECT_NAMES)
+@pytest.mark.parametrize("name", PAPER_OBJECTS)
 def test_rays_and_egl_see_the_same_depth_and_the_same_object(name: str) -> None:
     config = SceneConfig(object=name, pitch_deg=20.0, lateral_m=0.05)
     egl, rays = _draw(config, "egl"), _draw(config, "rays")
@@ -49,7 +49,7 @@ def test_the_table_is_where_the_pinhole_and_the_mount_say() -> None:
 
 
 @needs_egl
-@pytest.mark.parametrize("name", OBJECT_NAMES)
+@pytest.mark.parametrize("name", PAPER_OBJECTS)
 def test_from_home_every_object_is_seen_past_the_open_jaws_and_beyond_min_z(name: str) -> None:
     world = World(SceneConfig(object=name))
     data = world.snapshot()

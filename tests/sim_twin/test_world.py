@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from hal import z1
-from sim_twin.objects import OBJECT_NAMES
+from sim_twin.objects import PAPER_OBJECTS
 from sim_twin.scene import SceneConfig
 from sim_twin.world import GRIPPER_START_RAD, World
 
@@ -101,7 +101,7 @@ def _object_in_gripper(world: World) -> np.ndarray:
     return np.linalg.inv(T_base_gripper) @ world.T_base_object()
 
 
-@pytest.mark.parametrize("name", OBJECT_NAMES)
+@pytest.mark.parametrize("name", PAPER_OBJECTS)
 def test_a_held_object_is_lifted_and_neither_slips_nor_sinks_in(name: str) -> None:
     world = World(SceneConfig(object=name))
     command = _put_between_the_jaws(world, along_m=0.080)

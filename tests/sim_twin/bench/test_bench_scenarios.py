@@ -1,6 +1,7 @@
 import pytest
 
-from sim_twin.bench.scenarios import PAPER_OBJECTS, Scenario, grid
+from sim_twin.bench.scenarios import OBJECT_SETS, PAPER_OBJECTS, Scenario, grid
+from sim_twin.objects import EXTENDED_OBJECTS
 
 
 def test_the_paper_has_81_scenarios_and_each_has_its_own_name_and_noise():
@@ -14,6 +15,12 @@ def test_every_scenario_is_one_that_the_twin_can_build():
     for scenario in grid(occlusions=(0.0, 0.5)):
         scene = scenario.scene()
         assert scene.T_base_object()[0, 3] == pytest.approx({"near": 0.40, "mid": 0.48, "far": 0.56}[scenario.distance])
+
+
+def test_the_extended_set_stands_upright_in_nine_poses_an_object():
+    scenarios = grid(objects=OBJECT_SETS["extended"])
+    assert len(scenarios) == 9 * len(EXTENDED_OBJECTS)
+    assert {s.pitch_deg for s in scenarios} == {0.0}
 
 
 def test_seeds_and_occlusions_multiply_the_poses():
