@@ -25,16 +25,17 @@ class HalProcess:
         scene: what stands on the table.
         bus: where it listens.
         log: file for what it says.
+        hal: which rig of the twin's, `sim` or `wire-sim`.
     """
 
-    def __init__(self, scene: SceneConfig, bus: BusConfig, log: Path) -> None:
+    def __init__(self, scene: SceneConfig, bus: BusConfig, log: Path, hal: str = "sim") -> None:
         options = {**asdict(scene), **asdict(bus)}
         del options["noise"], options["board"]  # a served camera always has its noise; no demo has a board
         arguments = [_option(name, value) for name, value in options.items()]
         self._log, self._ready = log, False
         with log.open("wb") as stderr:
             self._process = subprocess.Popen(
-                [sys.executable, "-P", "-m", "scripts.cli", "hal", "--hal=sim", "--until-stdin-closes", *arguments],
+                [sys.executable, "-P", "-m", "scripts.cli", "hal", f"--hal={hal}", "--until-stdin-closes", *arguments],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=stderr,

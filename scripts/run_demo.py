@@ -37,6 +37,8 @@ LIFTED_M = 0.05
 class Config:
     """What stands where, and what is written."""
 
+    hal: Literal["sim", "wire-sim"] = "sim"
+    """How the twin is reached: in the HAL's process, or through the real arm's and the real camera's drivers."""
     object: str = "bottle"
     """bottle, box or cylinder."""
     pitch_deg: float = 0.0
@@ -75,6 +77,10 @@ class Config:
     """A YAML file of settings (see `./z1 show-config`)."""
     bus: Annotated[BusConfig, tyro.conf.arg(name="")] = field(default_factory=BusConfig)
     """Where the two processes meet."""
+
+    def __post_init__(self) -> None:
+        if self.lockstep and self.hal != "sim":
+            raise ValueError(f"--lockstep has no wire to go through; leave out --hal {self.hal}.")
 
 
 def main(config: Config) -> int:
@@ -120,7 +126,7 @@ def main(config: Config) -> int:
 
 
 def _start_hal(config: Config, scene: SceneConfig, undo: ExitStack) -> HalProcess:
-    process = HalProcess(scene, config.bus, config.out / "hal.log")
+    process = HalProcess(scene, config.bus, config.out / "hal.log", config.hal)
     undo.callback(process.end)
     return process
 

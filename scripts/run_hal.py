@@ -1,6 +1,7 @@
 """Serve an arm and a camera over Zenoh: servo at 500 Hz, limits, watchdog and stop.
 
     ./z1 hal --hal sim --object bottle      the digital twin
+    ./z1 hal --hal wire-sim                 the twin behind the real arm's and the real camera's drivers
     ./z1 hal --hal mock                     an arm without physics, for trying clients
 
 Stop it with Ctrl-C: it brakes, holds, and lets go.
@@ -22,6 +23,8 @@ from hal.guard import Workspace
 from hal.process import serve, stop_on_signals
 from hal.rig import RIGS, Rig
 
+TWINS = ("sim", "wire-sim")
+"""Rigs that are made of a scene."""
 READY = "ready"
 """The line printed once everything answers."""
 
@@ -31,7 +34,7 @@ class Config:
     """Which hardware, where, and for the twin what stands on the table."""
 
     hal: str = "sim"
-    """Which rig: `sim` is the twin, `mock` an arm without physics."""
+    """Which rig: `sim` is the twin, `wire-sim` the same behind the real drivers, `mock` an arm without physics."""
     object: str = "bottle"
     """Twin: what stands on the table: bottle, box or cylinder."""
     distance_m: float = 0.48
@@ -88,7 +91,7 @@ def make_rig(config: Config) -> Rig:
         UnknownBackendError: no such rig.
         ValueError: the scene is out of range.
     """
-    if config.hal != "sim":
+    if config.hal not in TWINS:
         return RIGS.make(config.hal)
     from calibration.board import Board
     from scripts.calibration_robot import RobotOptions, make_print
@@ -105,7 +108,7 @@ def make_rig(config: Config) -> Rig:
         mount_error_deg=config.mount_error_deg,
         mount_seed=config.mount_seed,
     )
-    return RIGS.make("sim", scene=scene)
+    return RIGS.make(config.hal, scene=scene)
 
 
 def _watch_stdin(stop_event: Event) -> None:

@@ -1,8 +1,9 @@
 """The digital twin in place of a device, for programs that were written for the device.
 
     ./z1 twin run-script [options] FILE.py [its own arguments]    a script for pyrealsense2 sees the twin's D405
+    ./z1 twin wire [options]                                      the twin's Z1 in place of `z1_ctrl` (or: twin --wire)
 
-`./z1 twin run-script --help` tells the options.
+`./z1 twin run-script --help` and `./z1 twin wire --help` tell the options.
 """
 
 from __future__ import annotations
@@ -10,15 +11,16 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 
-from scripts import run_script
+from scripts import run_script, run_wire
 
-_STEPS: dict[str, Callable[[list[str]], int]] = {"run-script": run_script.main}
+_STEPS: dict[str, Callable[[list[str]], int]] = {"run-script": run_script.main, "wire": run_wire.main}
 _BAD_USAGE = 2
 
 
 def main(arguments: list[str]) -> int:
     """Do what the first argument names."""
     name, *rest = arguments or [""]
+    name = "wire" if name == "--wire" else name
     if name in _STEPS:
         return _STEPS[name](rest)
     if name in ("-h", "--help"):

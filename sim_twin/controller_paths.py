@@ -7,6 +7,7 @@ for, and stay within what the joints can do.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -23,6 +24,14 @@ _PEAK_SPEED, _PEAK_ACCELERATION = 1.875, 5.7735
 _STEP_M, _STEP_RAD, _MOST_STEPS = 0.01, 0.04, 200
 _TURN_SPEED = 1.0  # [rad/s]
 _STRAIGHT = 1e-6
+
+
+class _Curve(NamedTuple):
+    """Where the pivot goes, over 0 to 1."""
+
+    place: Callable[[float], np.ndarray]
+    turn: Slerp
+    length_m: float
 
 
 class Path:
@@ -63,7 +72,8 @@ def line_path(model: Z1Model, start: np.ndarray, posture: np.ndarray, gripper: f
     first, last = model.forwardKinematics(start[: z1.N_ARM]), postureToHomo(posture)
     turn = Slerp([0.0, 1.0], Rotation.from_matrix([first[:3, :3], last[:3, :3]]))
     way = last[:3, 3] - first[:3, 3]
-    return _along(model, start, gripper, speed, lambda u: first[:3, 3] + u * way, turn, float(np.linalg.norm(way)))
+    curve = _Curve(lambda u: first[:3, 3] + u * way, turn, float(np.linalg.norm(way)))
+    return _along(model, start, gripper, speed, curve)
 
 
 def arc_path(model: Z1Model, start: np.ndarray, postures: np.ndarray, gripper: float, speed: float) -> Path | None:
@@ -86,32 +96,23 @@ def arc_path(model: Z1Model, start: np.ndarray, postures: np.ndarray, gripper: f
     def place(u: float) -> np.ndarray:
         return centre + radius * (np.cos(u * end) * x_axis + np.sin(u * end) * y_axis)
 
-    return _along(model, start, gripper, speed, place, turn, radius * end)
+    return _along(model, start, gripper, speed, _Curve(place, turn, radius * end))
 
 
-def _along(
-    model: Z1Model,
-    start: np.ndarray,
-    gripper: float,
-    speed: float,
-    place: Callable[[float], np.ndarray],
-    turn: Slerp,
-    length_m: float,
-) -> Path | None:
-    keys = turn(turn.times)
+def _along(model: Z1Model, start: np.ndarray, gripper: float, speed: float, curve: _Curve) -> Path | None:
+    keys = curve.turn(curve.turn.times)
     angle = float((keys[:-1].inv() * keys[1:]).magnitude().sum())
-    steps = int(np.clip(np.ceil(max(length_m / _STEP_M, angle / _STEP_RAD)), 2, _MOST_STEPS))
+    steps = int(np.clip(np.ceil(max(curve.length_m / _STEP_M, angle / _STEP_RAD)), 2, _MOST_STEPS))
     points = np.empty((steps + 1, z1.N_JOINTS))
     points[0] = start
     points[:, z1.N_ARM] = np.linspace(start[z1.N_ARM], gripper, steps + 1)
     T = np.eye(4)
     for i in range(1, steps + 1):
-        u = i / steps
-        T[:3, :3], T[:3, 3] = turn(u).as_matrix(), place(u)
+        T[:3, :3], T[:3, 3] = curve.turn(i / steps).as_matrix(), curve.place(i / steps)
         found, points[i, : z1.N_ARM] = model.inverseKinematics(T, points[i - 1, : z1.N_ARM])
         if not found:
             return None
-    pivot_s = _PEAK_SPEED * max(length_m / speed, angle / _TURN_SPEED)
+    pivot_s = _PEAK_SPEED * max(curve.length_m / speed, angle / _TURN_SPEED)
     return Path(points, max(pivot_s, _duration(points, float(z1.DQ_MAX[0]))))
 
 

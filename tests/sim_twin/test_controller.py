@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -71,6 +72,10 @@ def pose_at(q: np.ndarray) -> np.ndarray:
     return homoToPosture(Z1Model.with_gripper().forwardKinematics(q[:6]))
 
 
+def shifted(posture: np.ndarray, *by: float) -> np.ndarray:
+    return posture + np.array(by)
+
+
 def move_to(*postures: np.ndarray, gripper: float = -0.5, speed: float = 1.0) -> TrajectoryCommand:
     poses = np.zeros((2, 6))
     poses[: len(postures)] = postures
@@ -83,7 +88,7 @@ def bodies(asked: Fsm) -> JointCommands | TrajectoryCommand | str | None:
             return move_to(pose_at(LABELS["forward"]))
         case Fsm.MOVEC:
             here = pose_at(START)
-            return move_to(here + [0, 0, 0, 0.02, 0.02, 0], here + [0, 0, 0, 0, 0.04, 0])
+            return move_to(shifted(here, 0, 0, 0, 0.02, 0.02, 0), shifted(here, 0, 0, 0, 0, 0.04, 0))
         case Fsm.TOSTATE:
             return "forward"
         case Fsm.SAVESTATE | Fsm.TEACH:
@@ -165,7 +170,7 @@ def test_a_move_without_speed_is_no_move(arm: IdealArm) -> None:
 def test_movel_keeps_to_the_line(arm: IdealArm) -> None:
     arm.ask(Fsm.JOINTCTRL)
     start = pose_at(START)
-    goal = start + [0, 0, 0, -0.05, 0.10, 0.05]
+    goal = shifted(start, 0, 0, 0, -0.05, 0.10, 0.05)
     arm.ask(Fsm.MOVEL, move_to(goal, speed=0.1))
     way, places, before = (goal - start)[3:], [], start[3:]
     while arm.controller.fsm is Fsm.MOVEL:
@@ -181,8 +186,8 @@ def test_movel_keeps_to_the_line(arm: IdealArm) -> None:
 def test_movec_goes_round_through_the_middle(arm: IdealArm) -> None:
     arm.ask(Fsm.JOINTCTRL)
     start = pose_at(START)
-    centre = start + [0, 0, 0, 0, 0.05, 0]
-    arm.ask(Fsm.MOVEC, move_to(centre + [0, 0, 0, -0.05, 0, 0], centre + [0, 0, 0, 0, 0.05, 0], speed=0.1))
+    centre = shifted(start, 0, 0, 0, 0, 0.05, 0)
+    arm.ask(Fsm.MOVEC, move_to(shifted(centre, 0, 0, 0, -0.05, 0, 0), shifted(centre, 0, 0, 0, 0, 0.05, 0), speed=0.1))
     radii, nearest = [], 1.0
     while arm.controller.fsm is Fsm.MOVEC:
         arm.run(0.02)
@@ -190,13 +195,16 @@ def test_movec_goes_round_through_the_middle(arm: IdealArm) -> None:
         nearest = min(nearest, float(np.linalg.norm((arm.pose - centre)[3:] - [-0.05, 0, 0])))
     assert radii == pytest.approx(np.full(len(radii), 0.05), abs=5e-4)
     assert nearest < 2e-3
-    assert arm.pose == pytest.approx(centre + [0, 0, 0, 0, 0.05, 0], abs=1e-5)
+    assert arm.pose == pytest.approx(shifted(centre, 0, 0, 0, 0, 0.05, 0), abs=1e-5)
 
 
 def test_three_points_on_a_line_make_no_arc(arm: IdealArm) -> None:
     arm.ask(Fsm.JOINTCTRL)
     start = pose_at(START)
-    assert arm.ask(Fsm.MOVEC, move_to(start + [0, 0, 0, 0, 0.02, 0], start + [0, 0, 0, 0, 0.04, 0])) is Fsm.JOINTCTRL
+    assert (
+        arm.ask(Fsm.MOVEC, move_to(shifted(start, 0, 0, 0, 0, 0.02, 0), shifted(start, 0, 0, 0, 0, 0.04, 0)))
+        is Fsm.JOINTCTRL
+    )
 
 
 def test_a_label_is_gone_to_and_an_unknown_one_is_not(arm: IdealArm) -> None:
@@ -309,7 +317,7 @@ def test_the_commanded_speed_reaches_the_motors_up_to_the_limit(arm: IdealArm) -
 
 def test_a_tracked_pose_is_followed_and_one_out_of_reach_is_not(arm: IdealArm) -> None:
     arm.ask(Fsm.CARTESIAN)
-    goal = pose_at(START) + [0, 0, 0.05, 0, 0.02, 0.01]
+    goal = shifted(pose_at(START), 0, 0, 0.05, 0, 0.02, 0.01)
     arm.ask(Fsm.INVALID, move_to(goal, gripper=-0.7), track=True)
     arm.run(0.5)
     assert arm.pose == pytest.approx(goal, abs=1e-6)
@@ -355,7 +363,7 @@ def test_a_body_that_is_not_finite_changes_nothing(arm: IdealArm) -> None:
     broken = bytearray(encode_command(Fsm.LOWCMD))
     broken[7:11] = np.float32(np.nan).tobytes()
     with pytest.raises(WireError, match="must be finite"):
-        arm.controller.obey(decode_command(broken))
+        arm.controller.obey(decode_command(bytes(broken)))
     assert arm.controller.fsm is Fsm.PASSIVE
     arm.ask(Fsm.JOINTCTRL)
     with pytest.raises(WireError, match="a label is"):
@@ -415,7 +423,7 @@ def test_every_second_answer_repeats_the_measurement(twin: ControlledWorld) -> N
     for _ in range(40):
         run(twin, 0.002)
         answers.append(twin.answer())
-    assert sum(a == b for a, b in zip(answers, answers[1:], strict=False)) in (19, 20)
+    assert sum(a == b for a, b in pairwise(answers)) in (19, 20)
 
 
 def test_a_silent_board_leaves_stale_answers_and_is_recovered_from(twin: ControlledWorld) -> None:
