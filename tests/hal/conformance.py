@@ -27,9 +27,13 @@ from hal.registry import ARMS, CAMERAS
 from hal.rig import RIGS
 from hal.servo import Servo
 from hal.servo_thread import ServoThread
+from sim_twin.clock import TwinClock
+from sim_twin.controlled_world import ControlledWorld
 from sim_twin.realsense_source import TwinSource
 from sim_twin.scene import SceneConfig
 from sim_twin.world import World
+
+TWIN_Z1 = "z1 over the twin"
 
 
 @dataclass(frozen=True)
@@ -68,9 +72,13 @@ def make_backend(registry: Any, name: str) -> tuple[Any, Clock]:
     return device, device.clock
 
 
+def make_arm(name: str) -> tuple[Any, Clock]:
+    return z1_over_the_twin() if name == TWIN_Z1 else make_backend(ARMS, name)
+
+
 @contextmanager
 def registered_arm(name: str) -> Iterator[ArmCase]:
-    arm, clock = make_backend(ARMS, name)
+    arm, clock = make_arm(name)
     yield ArmCase(arm, clock)
     arm.disconnect()
 
@@ -96,7 +104,7 @@ class TickingClock:
 
 @contextmanager
 def servoed_arm(name: str) -> Iterator[ArmCase]:
-    arm, inner = make_backend(ARMS, name)
+    arm, inner = make_arm(name)
     clock = TickingClock(inner)
     servo = clock.servo = Servo(arm, inner)
 
@@ -111,6 +119,14 @@ def servoed_arm(name: str) -> Iterator[ArmCase]:
     yield ArmCase(servo, clock, prepare, revive)
     clock.ticking = False
     servo.disconnect()
+
+
+def z1_over_the_twin() -> tuple[Arm, Clock]:
+    """The real arm's driver, with the twin's controller at the other end of the wire, in lock-step."""
+    world = World(SceneConfig())
+    twin, clock = ControlledWorld(world), TwinClock(world)
+    clock.call_every_tick(twin.tick)
+    return ARMS.make("z1", clock=clock, link=MemoryLink(twin, clock, latency_s=0.0)), clock
 
 
 @contextmanager
@@ -166,9 +182,10 @@ def d405_over_the_twin() -> Iterator[CameraCase]:
     camera.disconnect()
 
 
+ARM_NAMES = (*ARMS.names(), TWIN_Z1)
 ARM_CASES: list[tuple[str, Callable[[], AbstractContextManager[ArmCase]]]] = [
-    *((name, partial(registered_arm, name)) for name in ARMS.names()),
-    *((f"servo over {name}", partial(servoed_arm, name)) for name in ARMS.names()),
+    *((name, partial(registered_arm, name)) for name in ARM_NAMES),
+    *((f"servo over {name}", partial(servoed_arm, name)) for name in ARM_NAMES),
     ("remote", remote_arm),
 ]
 CAMERA_CASES: list[tuple[str, Callable[[], AbstractContextManager[CameraCase]]]] = [

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
 from threading import Event, Thread
+from typing import Protocol
 
 import numpy as np
 
@@ -193,10 +194,16 @@ class FakeController:
             self.fsm, self._goal = Fsm.JOINTCTRL, None
 
 
-class MemoryLink:
-    """The way to a fake controller within one process and one clock; `mangle` may do anything to what passes."""
+class Peer(Protocol):
+    """Who answers datagrams."""
 
-    def __init__(self, peer: FakeController, clock: Clock, latency_s: float = 0.001) -> None:
+    def handle(self, data: bytes) -> bytes | None: ...
+
+
+class MemoryLink:
+    """The way to a controller within one process and one clock; `mangle` may do anything to what passes."""
+
+    def __init__(self, peer: Peer, clock: Clock, latency_s: float = 0.001) -> None:
         self.peer = peer
         self.clock = clock
         self.latency_s = latency_s
