@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -27,8 +27,10 @@ class Config:
 
     methods: tuple[str, ...] = ("vanilla", "mvb", "full")
     """vanilla, mvb and full; a setting can be changed, as in `mvb:k=3,alpha=0.5,box=upright,hard_filter=no`."""
-    objects: tuple[str, ...] = ("bottle", "box", "cylinder")
-    """What stands on the table."""
+    set: Literal["paper", "extended"] = "paper"
+    """The paper's objects in 27 poses each, or the further ones, upright, in 9."""
+    objects: tuple[str, ...] = ()
+    """What stands on the table, if not all objects of the set."""
     occlusion: tuple[float, ...] = (0.0,)
     """Shares of the object hidden from the camera."""
     seeds: tuple[int, ...] = (0,)
@@ -43,15 +45,19 @@ class Config:
     """Episodes side by side, a process each."""
     resume: bool = False
     """Go on with an interrupted run in the same folder."""
+    pictures: Literal["failures", "all", "none"] = "none"
+    """Final states to draw into pictures/: up to 12 failures, which the report shows too, or every episode's."""
     out: Path = Path("out/bench")
-    """Folder for episodes/, episodes.parquet and summary.json."""
+    """Folder for episodes/, episodes.parquet, summary.json and report.html."""
 
 
 def main(config: Config) -> int:
     """Run what is missing, and say how it went."""
     from sim_twin.bench.methods import parse_method
+    from sim_twin.bench.pictures import draw_pictures
+    from sim_twin.bench.report import write_report
     from sim_twin.bench.runner import make_tasks
-    from sim_twin.bench.scenarios import grid
+    from sim_twin.bench.scenarios import OBJECT_SETS, grid
     from sim_twin.bench.store import Store
     from sim_twin.bench.summary import write_summary
     from z1_runtime.config import load_config
@@ -59,12 +65,14 @@ def main(config: Config) -> int:
     if config.jobs < 1:
         raise ValueError(f"jobs is {config.jobs}; allowed is 1 or more.")
     methods = [parse_method(text) for text in config.methods]
-    scenarios = grid(config.objects, config.seeds, config.occlusion)
+    scenarios = grid(config.objects or OBJECT_SETS[config.set], config.seeds, config.occlusion)
     changes = {"generator": config.generator, "detector": config.detector}
     runtime = replace(load_config(config.config), **{key: value for key, value in changes.items() if value})
     store = Store(config.out, config.resume)
     tasks = make_tasks(scenarios, methods, runtime, store.done())
     console = Console(highlight=False)
+    report = config.out / "report.html"
+    rows, summary = [], {}
     try:
         _run(tasks, config.jobs, store, console)
     finally:
@@ -73,8 +81,12 @@ def main(config: Config) -> int:
             store.write_table()
             run = {"version": version("z1-grasp"), "command": _plain(asdict(config)), "settings": asdict(runtime)}
             summary = write_summary(rows, config.out / "summary.json", _plain(run))
+            write_report(rows, summary, report)
             _print(console, summary)
-    console.print(f"rows: {config.out}/episodes.parquet, figures: {config.out}/summary.json")
+    pictures = draw_pictures(rows, config.pictures, config.out / "pictures")
+    if pictures:
+        write_report(rows, summary, report, pictures)
+    console.print(f"rows: {config.out}/episodes.parquet, figures: {config.out}/summary.json and report.html")
     return 0
 
 

@@ -78,10 +78,11 @@ def _run_method(scenario: Scenario, method: Method, decider: Decider, seen: Seen
         outcome = Outcome(mode=_why_no_plan(rejections), detail=str(error))
         return _row(scenario, method, outcome, times, seen, ranked=ranked, n_free=n_free, rejections=rejections)
     limits = MotionLimits.at_speed(decider.config.speed)
-    outcome, _ = act(scenario.scene(), plan, decider.kinematics, limits)
-    return _row(
+    outcome, qpos = act(scenario.scene(), plan, decider.kinematics, limits)
+    row = _row(
         scenario, method, outcome, times, seen, ranked=ranked, n_free=n_free, plan=plan, rejections=plan.rejections
     )
+    return row | {"final_qpos": qpos.tolist()}
 
 
 def _why_no_plan(rejections: Sequence[Rejection]) -> Mode:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
 from itertools import product
+from typing import Any
 
 from sim_twin.objects import EXTENDED_OBJECTS, OBJECT_NAMES, PAPER_OBJECTS
 from sim_twin.scene import SceneConfig
@@ -66,6 +67,11 @@ class Scenario:
             pitch_deg=self.pitch_deg,
             seed=self.draw_seed,
         )
+
+    @classmethod
+    def of(cls, row: Mapping[str, Any]) -> Scenario:
+        """Return the scenario of a table's row: what `features` gave, maybe among other columns."""
+        return cls(**{field.name: row[field.name] for field in fields(cls)})
 
     def features(self) -> dict[str, object]:
         """Return what identifies it, as columns of a table."""

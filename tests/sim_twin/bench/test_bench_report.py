@@ -91,9 +91,12 @@ def test_pictures_are_in_the_page(tmp_path):
 
 def test_bars_are_as_long_as_the_rates_and_nothing_lies_on_another():
     plot = svg.rate_bars(["a", "b"], {"x": [(1, 4), (0, 0)], "y": [(4, 4), (2, 4)]}, "caption")
-    root = ElementTree.fromstring(re.search(r"<svg.*</svg>", plot)[0])
+    (drawing,) = re.findall(r"<svg.*</svg>", plot)
+    root = ElementTree.fromstring(drawing)
     bars = [
-        {key: float(bar.get(key)) for key in ("y", "width", "height")} for bar in root.iter() if bar.tag[-4:] == "rect"
+        {key: float(bar.attrib[key]) for key in ("y", "width", "height")}
+        for bar in root.iter()
+        if bar.tag[-4:] == "rect"
     ]
     assert [bar["width"] / bars[1]["width"] for bar in bars] == pytest.approx([0.25, 1.0, 0.5])
     bars.sort(key=lambda bar: bar["y"])
