@@ -16,7 +16,7 @@ COMMANDS = {
     "bench": ("scripts.run_benchmark", "the paper's 81 scenarios: success by method, with intervals"),
     "hal": ("scripts.run_hal", "serve the arm and the camera, with the servo loop and its limits"),
     "calibrate": ("scripts.calibrate", "the wrist camera, with a printed board: hand-eye, intrinsics, touch test"),
-    "twin": ("scripts.run_twin", "the twin in place of a device: run-script, for what was written for pyrealsense2"),
+    "twin": ("scripts.run_twin", "the twin in place of a device: run-script for pyrealsense2, wire for a Z1's clients"),
     "stop": ("scripts.stop_arm", "stop the arm now; it stays stopped until re-armed"),
     "rearm": ("scripts.rearm_arm", "lift the stop, after somebody has looked at the arm"),
     "doctor": ("scripts.doctor", "what of this machine is ready, and how to fix the rest"),

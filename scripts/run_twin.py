@@ -9,11 +9,9 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from importlib import import_module
 
-from scripts import run_script, run_wire
-
-_STEPS: dict[str, Callable[[list[str]], int]] = {"run-script": run_script.main, "wire": run_wire.main}
+_STEPS = {"run-script": "scripts.run_script", "wire": "scripts.run_wire"}
 _BAD_USAGE = 2
 
 
@@ -22,7 +20,7 @@ def main(arguments: list[str]) -> int:
     name, *rest = arguments or [""]
     name = "wire" if name == "--wire" else name
     if name in _STEPS:
-        return _STEPS[name](rest)
+        return import_module(_STEPS[name]).main(rest)
     if name in ("-h", "--help"):
         print(__doc__)
         return 0

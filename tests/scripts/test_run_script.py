@@ -92,7 +92,7 @@ def test_a_script_that_is_not_there_and_a_step_that_is_unknown_are_bad_usage(tmp
     command = [sys.executable, "-P", "-m", "scripts.cli", "twin", "run-scrip"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 2
-    assert "run-script; not 'run-scrip'" in done.stderr
+    assert "run-script, wire; not 'run-scrip'" in done.stderr
 
 
 def test_windows_keep_their_last_picture_and_press_keys_in_the_end(tmp_path: Path) -> None:

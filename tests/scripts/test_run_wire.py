@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import json
 import signal
 import socket
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from hal.wire.controller import LABELS, decode_state, encode_command
 from hal.wire.states import Fsm
+from scripts.run_demo import LIFTED_M
 from scripts.run_demo import Config as DemoConfig
 from scripts.run_wire import Config, make_server
 from sim_twin.wire_rig import free_ports
@@ -58,6 +61,17 @@ def test_the_folded_arm_rests_on_itself_in_passive() -> None:
 
 def test_home_is_where_the_camera_looks_from() -> None:
     assert make_server(Config(start="home", object="box")).twin.world.read_arm()[0][1] == pytest.approx(1.085, abs=0.01)
+
+
+@pytest.mark.slow
+def test_the_demo_lifts_the_bottle_through_both_real_drivers(tmp_path: Path) -> None:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    command = [sys.executable, "-P", "-m", "scripts.cli", "demo", "--hal=wire-sim", f"--out={tmp_path}"]
+    subprocess.run([*command, f"--port={port}"], check=True, timeout=240)
+    assert json.loads((tmp_path / "summary.json").read_text())["lifted_m"] >= LIFTED_M
+    assert "Z1: connected to 127.0.0.1" in (tmp_path / "hal.log").read_text()
 
 
 def test_a_demo_through_the_wire_cannot_be_in_lockstep() -> None:
