@@ -122,7 +122,7 @@ def find_rest(limits: ServoLimits, q: np.ndarray, dq: np.ndarray) -> np.ndarray:
 def _joint_placements() -> np.ndarray:
     """Return (6, 4, 4) the pose of each arm joint's frame in its parent link at angle 0 (URDF); it turns about its axis
     of `_AXES`."""
-    import pinocchio as pin
+    import pinocchio as pin  # pyright: ignore[reportMissingImports] - a .pth file leads to it
 
     model = pin.buildModelFromUrdf(str(z1.urdf_path()))
     placements = np.empty((z1.N_ARM, 4, 4))

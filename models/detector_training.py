@@ -126,7 +126,7 @@ class CpuSegmentationTrainer(SegmentationTrainer):
     def get_model(self, cfg=None, weights=None, verbose=True):
         """Return the network, with `weights` if given."""
         model = Bf16SegmentationModel(
-            cfg or f"{ARCHITECTURE}.yaml", nc=self.data["nc"], ch=self.data["channels"], verbose=False
+            str(cfg or f"{ARCHITECTURE}.yaml"), nc=self.data["nc"], ch=self.data["channels"], verbose=False
         )
         model = self.set_model_names_for_load(model)
         if weights:
