@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from base64 import b64encode
 from collections.abc import Callable, Mapping, Sequence
 from html import escape
@@ -12,6 +13,7 @@ import numpy as np
 
 from sim_twin.bench import svg
 from sim_twin.bench.episode import Row
+from sim_twin.bench.methods import METHODS
 from sim_twin.bench.scenarios import DISTANCES_M, LATERALS_M
 from sim_twin.bench.summary import STAGES
 
@@ -54,17 +56,18 @@ def write_report(
         path: of the HTML file; it is replaced once the new one is whole.
         pictures: JPEG files by what is said below each.
     """
-    names = list(summary["methods"])
+    names = sorted(summary["methods"], key=lambda name: list(METHODS).index(name.partition(":")[0]))
+    methods = {name: summary["methods"][name] for name in names}
     own = {name: [row for row in rows if row["method"] == name] for name in names}
     title = "Grasping benchmark"
     parts = [
         f"<h1>{title}</h1>",
         _scope(rows, summary.get("run", {})),
-        "<h2>Success</h2>" + _headline(summary),
+        "<h2>Success</h2>" + _headline(methods),
         "<h2>Methods against each other</h2>" + _paired(summary["paired"]),
         *(_condition(column, words, own) for column, words in _CONDITIONS.items()),
         "<h2>Distance × lateral position</h2>" + _grids(own),
-        "<h2>How episodes ended</h2>" + _modes(summary),
+        "<h2>How episodes ended</h2>" + _modes(methods),
         "<h2>Candidates</h2>" + _candidates(own),
         "<h2>Latency</h2>" + _latency(own),
         _gallery(pictures or {}),
@@ -81,18 +84,14 @@ def _scope(rows: Sequence[Row], run: Mapping[str, Any]) -> str:
     words = f"{len(scenarios)} scenarios, {len(rows)} episodes; seeds {', '.join(map(str, seeds))}."
     if "version" in run:
         words += f" Version {run['version']}."
-    command = run.get("command")
-    settings = (
-        ""
-        if command is None
-        else f"<details><summary>What was run</summary><pre>{escape(str(dict(run)))}</pre></details>"
-    )
+    text = escape(json.dumps(run, indent=1, ensure_ascii=False, default=str))
+    settings = f"<details><summary>What was run</summary><pre>{text}</pre></details>" if run else ""
     return f"<p>{escape(words)}</p>{settings}"
 
 
-def _headline(summary: Mapping[str, Any]) -> str:
+def _headline(methods: Mapping[str, Any]) -> str:
     lines = []
-    for name, method in summary["methods"].items():
+    for name, method in methods.items():
         paper = PAPER_RATES.get(name)
         lines.append(
             [
@@ -107,6 +106,7 @@ def _headline(summary: Mapping[str, Any]) -> str:
         )
     table = _table(["method", "episodes", "fallthrough", "95 %", "top1", "95 %", "the paper's"], lines)
     notes = "; ".join(f"{reading}: {words}" for reading, (_, words) in _READINGS.items())
+    notes += ". The paper's figures are those of its own 81 episodes: three objects in 27 poses"
     return f"{table}<p><small>Two readings of the same episodes. {escape(notes)}. Intervals: Wilson.</small></p>"
 
 
@@ -154,8 +154,8 @@ def _grids(own: Mapping[str, Sequence[Row]]) -> str:
     return f"<p><small>As the robot sees it, from its base.</small></p><div class='row'>{''.join(plots)}</div>"
 
 
-def _modes(summary: Mapping[str, Any]) -> str:
-    modes = {name: method["modes"] for name, method in summary["methods"].items()}
+def _modes(methods: Mapping[str, Any]) -> str:
+    modes = {name: method["modes"] for name, method in methods.items()}
     return svg.share_bars(modes, "success", "Episodes by how they ended (fallthrough).")
 
 
@@ -167,7 +167,7 @@ def _candidates(own: Mapping[str, Sequence[Row]]) -> str:
         means = [_figure(_values(part, column), np.mean, "{:.1f}") for column in refused]
         lines.append([name, *medians, *means])
     head = ["method", *_COUNTS.values(), *(f"refused: {column.removeprefix('rejected_')}" for column in refused)]
-    note = "Medians an episode; candidates refused by the planner before the executed one: means an episode."
+    note = "Medians an episode; refused: by the planner before it took one, or all if it took none; means an episode."
     return f"{_table(head, lines)}<p><small>{note}</small></p>"
 
 

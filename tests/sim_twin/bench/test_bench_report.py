@@ -69,6 +69,11 @@ def test_conditions_stand_in_the_order_people_count_them(page):
     assert words.index("-45") < words.index("0") < words.index("45")
 
 
+def test_methods_stand_in_their_order_whatever_the_rows(tmp_path):
+    page = write(tmp_path / "report.html", make_rows(("full", "mvb:k=3", "mvb", "vanilla")))
+    assert re.findall(r"<tr><td>([^<]*)</td><td>81</td>", page) == ["vanilla", "mvb:k=3", "mvb", "full"]
+
+
 def test_a_count_that_was_never_made_is_no_count(tmp_path):
     rows = [row | {"n_free": -1} for row in make_rows(("mvb",))]
     line = next(
