@@ -126,7 +126,10 @@ class CpuSegmentationTrainer(SegmentationTrainer):
     def get_model(self, cfg=None, weights=None, verbose=True):
         """Return the network, with `weights` if given."""
         model = Bf16SegmentationModel(
-            str(cfg or f"{ARCHITECTURE}.yaml"), nc=self.data["nc"], ch=self.data["channels"], verbose=False
+            cfg or f"{ARCHITECTURE}.yaml",  # pyright: ignore[reportArgumentType] - a checkpoint's is a dict
+            nc=self.data["nc"],
+            ch=self.data["channels"],
+            verbose=False,
         )
         model = self.set_model_names_for_load(model)
         if weights:

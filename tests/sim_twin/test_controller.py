@@ -466,3 +466,13 @@ def test_random_bytes_and_mutilated_commands_are_counted_and_never_crash(twin: C
     assert twin.refused == refused > 3000
     assert twin.last_refusal
     assert np.isfinite(twin.world.read_arm()[0]).all()
+
+
+def test_the_worlds_own_servos_take_over_again_from_motors_that_were_let_go(twin: ControlledWorld) -> None:
+    twin.take(encode_command(Fsm.LOWCMD))  # neither stiffness nor torque: it falls
+    q = run(twin, 0.1)
+    assert np.abs(twin.world.read_arm()[1]).max() > 0.5
+    twin.world.set_command(q, np.zeros(7))
+    for _ in range(500):
+        twin.world.step()
+    assert np.abs(twin.world.read_arm()[0] - q).max() < 0.02
