@@ -47,6 +47,8 @@ class Config:
     """Go on with an interrupted run in the same folder."""
     pictures: Literal["failures", "all", "none"] = "none"
     """Final states to draw into pictures/: up to 12 failures, which the report shows too, or every episode's."""
+    recordings: Literal["failures", "all", "none"] = "none"
+    """Episodes to write into recordings/ for Rerun: what was seen, ranked and chosen; about 2 MB each."""
     out: Path = Path("out/bench")
     """Folder for episodes/, episodes.parquet, summary.json and report.html."""
 
@@ -55,6 +57,7 @@ def main(config: Config) -> int:
     """Run what is missing, and say how it went."""
     from sim_twin.bench.methods import parse_method
     from sim_twin.bench.pictures import draw_pictures
+    from sim_twin.bench.recordings import Recordings
     from sim_twin.bench.report import write_report
     from sim_twin.bench.runner import make_tasks
     from sim_twin.bench.scenarios import OBJECT_SETS, grid
@@ -69,7 +72,9 @@ def main(config: Config) -> int:
     changes = {"generator": config.generator, "detector": config.detector}
     runtime = replace(load_config(config.config), **{key: value for key, value in changes.items() if value})
     store = Store(config.out, config.resume)
-    tasks = make_tasks(scenarios, methods, runtime, store.done())
+    folder = config.out / "recordings"
+    recordings = None if config.recordings == "none" else Recordings(folder=folder, choice=config.recordings)
+    tasks = make_tasks(scenarios, methods, runtime, store.done(), recordings)
     console = Console(highlight=False)
     report = config.out / "report.html"
     rows, summary = [], {}

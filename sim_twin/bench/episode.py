@@ -13,8 +13,9 @@ from hal.messages import RgbdFrame
 from models.mvbb import RankedGrasps
 from models.obb import DegenerateCloudError
 from models.types import GraspSet
-from sim_twin.bench.methods import Method
+from sim_twin.bench.methods import Method, file_name
 from sim_twin.bench.occlusion import occlude
+from sim_twin.bench.recordings import Recordings
 from sim_twin.bench.scenarios import Scenario
 from sim_twin.bench.trial import Mode, Outcome, act, look
 from z1_runtime.cloud import PerceptionError
@@ -40,13 +41,19 @@ class Seen:
     """detect, cloud, generate."""
 
 
-def run_scenario(scenario: Scenario, methods: Sequence[Method], make_decider: Callable[[int], Decider]) -> list[Row]:
+def run_scenario(
+    scenario: Scenario,
+    methods: Sequence[Method],
+    make_decider: Callable[[int], Decider],
+    recordings: Recordings | None = None,
+) -> list[Row]:
     """Return one row for each of `methods`, all on the same frame and the same candidates.
 
     Args:
         scenario: what stands where.
         methods: how candidates are ordered.
         make_decider: returns the runtime's decider with the generator's seed set to its argument.
+        recordings: which episodes are written for Rerun too.
     """
     scene, decider = scenario.scene(), make_decider(scenario.draw_seed)
     frame, q = look(scene)
@@ -62,13 +69,13 @@ def run_scenario(scenario: Scenario, methods: Sequence[Method], make_decider: Ca
     except ValueError as error:
         return [_row(scenario, method, Outcome(mode=Mode.NO_CANDIDATE, detail=str(error)), times) for method in methods]
     seen = Seen(frame=frame, q=q, observation=observation, candidates=candidates, times=times)
-    return [_run_method(scenario, method, decider, seen) for method in methods]
+    return [_run_method(scenario, method, decider, seen, recordings) for method in methods]
 
 
-def _run_method(scenario: Scenario, method: Method, decider: Decider, seen: Seen) -> Row:
+def _run_method(scenario: Scenario, method: Method, decider: Decider, seen: Seen, recordings: Recordings | None) -> Row:
     times = StageTimes()
     times.ms.update(seen.times.ms)
-    ranked, n_free = None, -1
+    ranked, n_free, plan, final = None, -1, None, {}
     try:
         with times.stage("rank"):
             ranked, n_free = method.order(seen.candidates, seen.observation, decider, seen.q)
@@ -76,13 +83,16 @@ def _run_method(scenario: Scenario, method: Method, decider: Decider, seen: Seen
     except (DegenerateCloudError, NoPlanError) as error:
         rejections = error.rejections if isinstance(error, NoPlanError) else ()
         outcome = Outcome(mode=_why_no_plan(rejections), detail=str(error))
-        return _row(scenario, method, outcome, times, seen, ranked=ranked, n_free=n_free, rejections=rejections)
-    limits = MotionLimits.at_speed(decider.config.speed)
-    outcome, qpos = act(scenario.scene(), plan, decider.kinematics, limits)
-    row = _row(
-        scenario, method, outcome, times, seen, ranked=ranked, n_free=n_free, plan=plan, rejections=plan.rejections
-    )
-    return row | {"final_qpos": qpos.tolist()}
+    else:
+        rejections = plan.rejections
+        limits = MotionLimits.at_speed(decider.config.speed)
+        outcome, qpos = act(scenario.scene(), plan, decider.kinematics, limits)
+        final["final_qpos"] = qpos.tolist()
+    row = _row(scenario, method, outcome, times, seen, ranked=ranked, n_free=n_free, plan=plan, rejections=rejections)
+    if recordings is not None:
+        name, success = f"{scenario.key}-{file_name(method.name)}", row["success"]
+        recordings.keep(name, success=success, observation=seen.observation, ranked=ranked, plan=plan)
+    return row | final
 
 
 def _why_no_plan(rejections: Sequence[Rejection]) -> Mode:

@@ -67,6 +67,11 @@ METHODS = {
 _SETTINGS = {"k": int, "alpha": float, "box": str, "hard_filter": "bool", "collision_filter": "bool"}
 
 
+def file_name(method: str) -> str:
+    """Return the name of a method without what a file's name cannot hold."""
+    return "".join(letter if letter.isalnum() or letter in ".-_" else "_" for letter in method)
+
+
 def parse_method(text: str) -> Method:
     """Return the method that `text` names: `mvb`, or with settings `mvb:k=3,alpha=0.5,box=upright,hard_filter=no`.
 

@@ -12,6 +12,7 @@ import numpy as np
 from PIL import Image
 
 from sim_twin.bench.episode import Row
+from sim_twin.bench.methods import file_name
 from sim_twin.bench.scenarios import Scenario
 from sim_twin.view import draw_picture
 
@@ -41,7 +42,7 @@ def draw_pictures(rows: Sequence[Row], choice: Choice, folder: Path) -> dict[str
         if row.get("final_qpos") is None:
             continue
         png = draw_picture(Scenario.of(row).scene(), np.array(row["final_qpos"]), *_SIZE)
-        (folder / f"{row['scenario']}-{_file_name(row['method'])}.png").write_bytes(png)
+        (folder / f"{row['scenario']}-{file_name(row['method'])}.png").write_bytes(png)
         if row in shown:
             pictures[f"{row['scenario']}, {row['method']}: {row['mode']}"] = _small_jpeg(png)
     return pictures
@@ -55,11 +56,6 @@ def choose_failures(rows: Sequence[Row], most: int = SHOWN) -> list[Row]:
             kinds.setdefault((row["method"], row["mode"]), []).append(row)
     turns = chain.from_iterable(zip_longest(*kinds.values()))
     return [row for row in turns if row is not None][:most]
-
-
-def _file_name(method: str) -> str:
-    """Return a method's name without what a file's name cannot hold."""
-    return "".join(letter if letter.isalnum() or letter in ".-_" else "_" for letter in method)
 
 
 def _small_jpeg(png: bytes) -> bytes:

@@ -12,6 +12,7 @@ from itertools import islice
 
 from sim_twin.bench.episode import Row, run_scenario
 from sim_twin.bench.methods import Method
+from sim_twin.bench.recordings import Recordings
 from sim_twin.bench.scenarios import Scenario
 from z1_runtime.config import RuntimeConfig
 
@@ -23,23 +24,28 @@ class Task:
     scenario: Scenario
     methods: tuple[Method, ...]
     config: RuntimeConfig
+    recordings: Recordings | None = None
 
 
 def make_tasks(
-    scenarios: Sequence[Scenario], methods: Sequence[Method], config: RuntimeConfig, done: set[tuple[str, str]]
+    scenarios: Sequence[Scenario],
+    methods: Sequence[Method],
+    config: RuntimeConfig,
+    done: set[tuple[str, str]],
+    recordings: Recordings | None = None,
 ) -> list[Task]:
     """Return what is left to do: methods of a scenario that are done are left out."""
     tasks = []
     for scenario in scenarios:
         left = tuple(method for method in methods if (scenario.key, method.name) not in done)
         if left:
-            tasks.append(Task(scenario=scenario, methods=left, config=config))
+            tasks.append(Task(scenario=scenario, methods=left, config=config, recordings=recordings))
     return tasks
 
 
 def run_task(task: Task) -> list[Row]:
     """Return the rows of one task; what it needs is built once in each process."""
-    return run_scenario(task.scenario, task.methods, lambda seed: _decider(task.config, seed))
+    return run_scenario(task.scenario, task.methods, lambda seed: _decider(task.config, seed), task.recordings)
 
 
 def run_tasks(tasks: Sequence[Task], jobs: int) -> Iterator[list[Row]]:

@@ -38,6 +38,7 @@ def test_an_upright_cylinder_is_lifted_and_held_still(rows):
     assert full["lifted_m"] > 0.08
     assert full["slip_m"] < 0.02
     assert full["jaws_touching"] == 2
+    assert full["final_qpos"][9] > 0.15  # the object's height: its middle stood at 75 mm
 
 
 def test_a_row_says_which_candidate_was_taken_and_why(rows):
