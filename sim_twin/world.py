@@ -15,6 +15,8 @@ from sim_twin.scene import PHYSICS_PERIOD_S, SceneConfig, build_model
 GRIPPER_START_RAD = -1.0
 KP_MOTOR_MAX, KD_MOTOR_MAX = 1e4, 1e3
 """What a motor's gains are cut to [Nm/rad], [Nm s/rad]: thirteen times the vendor's highest, and more."""
+_CTRL_MAX = 1e9
+"""MuJoCo takes 1e10 for a mistake; the effort limit is met long before."""
 _SUBSTEPS = round(z1.CONTROL_PERIOD_S / PHYSICS_PERIOD_S)
 _SETTLE_STEPS = 100
 
@@ -85,7 +87,7 @@ class World:
         kp, kd = np.clip(kp, 0.0, KP_MOTOR_MAX), np.clip(kd, 0.0, KD_MOTOR_MAX)
         with self._lock:
             self._set_servos(kp, kd, 0.0)
-            self.data.ctrl[:] = tau + kp * q + kd * dq
+            self.data.ctrl[:] = np.clip(tau + kp * q + kd * dq, -_CTRL_MAX, _CTRL_MAX)
 
     def _set_servos(self, kp: np.ndarray, kd: np.ndarray, gravcomp: np.ndarray | float) -> None:
         self.model.actuator_biasprm[:, 1] = -kp

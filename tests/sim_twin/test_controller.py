@@ -447,6 +447,7 @@ def test_gains_beyond_all_reason_do_not_break_the_physics(twin: ControlledWorld)
     q = run(twin, 0.5)
     assert np.isfinite(q).all()
     assert twin.world.data.time > 0.9  # MuJoCo starts anew when it has lost its way
+    assert not twin.world.data.warning.number.any()
     assert twin.handle(encode_command(Fsm.JOINTCTRL)) is not None
 
 
