@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import logging
+import os
 import socket
+import sys
 import threading
 from dataclasses import dataclass
 from typing import Self
@@ -17,6 +20,7 @@ from sim_twin.controlled_world import ControlledWorld
 
 log = logging.getLogger(__name__)
 
+_FIFO_PRIORITY = 70
 _MAX_CATCH_UP_S = 0.020
 _MOST_AT_ONCE = 1024
 _LARGEST = 2048
@@ -127,6 +131,7 @@ class WireServer:
 
     def _run(self, inlet: socket.socket) -> None:
         try:
+            _hurry()
             with inlet:
                 self._serve(inlet)
         except Exception as error:  # of every kind: who waits for answers has to learn why there are none
@@ -164,3 +169,13 @@ class WireServer:
             self.answers += 1
         except OSError as error:
             log.debug("an answer could not leave: %s", error)
+
+
+def _hurry() -> None:
+    """Ask for real time for this thread, as a controller of its own would have it; go on without what is not permitted.
+
+    Below the servo's thread, which may live in this process and waits for the answers.
+    """
+    if sys.platform == "linux":
+        with contextlib.suppress(OSError):
+            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_FIFO_PRIORITY))
