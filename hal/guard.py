@@ -14,10 +14,9 @@ from numba import njit
 
 from hal import z1
 from hal.limits import ServoLimits
-from hal.z1_shape import CAPSULES, GRIPPER_OBSTACLES, HAND_POINTS, MOVER_POINTS, SELF_PAIRS
+from hal.z1_shape import CAPSULE_PAIRS, CAPSULES, GRIPPER_OBSTACLES, HAND_POINTS, MOVER_POINTS, TABLE_LINKS
 
 _LINKS = ("link00", "link01", "link02", "link03", "link04", "link05", "link06")
-_TABLE_LINKS = ("link02", "link03", "link04", "link05")
 SLACK_M = 1e-3
 """Further outside than this is outside: an arm that rests on the edge may be told to stay there [m]."""
 _ROUNDING_M = 1e-9  # more, and repeated attempts would creep outwards
@@ -29,17 +28,8 @@ takes the hand off its line [m]."""
 _LINK = np.array([_LINKS.index(capsule.link) for capsule in CAPSULES])
 _ENDS = np.array([(capsule.start, capsule.end) for capsule in CAPSULES])
 _RADII = np.array([capsule.radius_m for capsule in CAPSULES])
-_MAY_MEET_TABLE = np.array([capsule.link in _TABLE_LINKS for capsule in CAPSULES])
+_MAY_MEET_TABLE = np.array([capsule.link in TABLE_LINKS for capsule in CAPSULES])
 _MAY_MEET_HAND = np.array([capsule.link in GRIPPER_OBSTACLES for capsule in CAPSULES])
-_PAIRS = np.array(
-    [
-        (i, j)
-        for link, others in SELF_PAIRS
-        for i, one in enumerate(CAPSULES)
-        for j, other in enumerate(CAPSULES)
-        if one.link == link and other.link in others
-    ]
-)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -208,8 +198,8 @@ def _margins(q, joints, lower, upper, T_flange_pivot):
                 _apply(links[_LINK[c]], _ENDS[c, e], ends[c, e])
                 if _MAY_MEET_TABLE[c]:
                     table[k] = min(table[k], ends[c, e, 2] - _RADII[c])
-        for i in range(len(_PAIRS)):
-            one, other = _PAIRS[i, 0], _PAIRS[i, 1]
+        for i in range(len(CAPSULE_PAIRS)):
+            one, other = CAPSULE_PAIRS[i, 0], CAPSULE_PAIRS[i, 1]
             gap = _segment_distance(ends[one, 0], ends[one, 1], ends[other, 0], ends[other, 1])
             own[k] = min(own[k], gap - _RADII[one] - _RADII[other])
         _chain(links[6], T_flange_pivot, 1, 0.0, pivot)

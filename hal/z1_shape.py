@@ -32,12 +32,23 @@ CAPSULES = (
 )
 """Fitted to the collision meshes; no mesh point sticks out further than 10 mm (a test measures it)."""
 
-SELF_PAIRS = (
-    ("link03", ("link00", "link01")),
-    ("link04", ("link00", "link01", "link02")),
-    ("link05", ("link00", "link01", "link02")),
+_MEET = {
+    "link03": ("link00", "link01"),
+    "link04": ("link00", "link01", "link02"),
+    "link05": ("link00", "link01", "link02"),
+}
+CAPSULE_PAIRS = np.array(
+    [
+        (i, j)
+        for i, one in enumerate(CAPSULES)
+        for j, other in enumerate(CAPSULES)
+        if other.link in _MEET.get(one.link, ())
+    ]
 )
-"""Links that can meet; neighbours on the chain always touch."""
+"""(P, 2) which capsules can meet, as indices of `CAPSULES`; neighbours on the chain always touch."""
+CAPSULE_PAIRS.setflags(write=False)
+TABLE_LINKS = ("link02", "link03", "link04", "link05")
+"""Links that move about enough to meet the table."""
 GRIPPER_OBSTACLES = ("link00", "link01", "link02", "link03")
 """Links that gripper and camera can meet."""
 

@@ -8,27 +8,17 @@ import numpy as np
 from numba import njit
 
 from hal import z1
-from hal.z1_shape import CAPSULES, GRIPPER_OBSTACLES, SELF_PAIRS
+from hal.z1_shape import CAPSULE_PAIRS, CAPSULES, GRIPPER_OBSTACLES, TABLE_LINKS
 from z1_runtime.gripper import mover_pose
 from z1_runtime.kinematics import Kinematics
 from z1_runtime.robot_model import gripper_shape
 from z1_runtime.types import Plane
 
-_TABLE_LINKS = ("link02", "link03", "link04", "link05")
-MAY_MEET_SCENE = np.array([c.link in _TABLE_LINKS for c in CAPSULES])
+MAY_MEET_SCENE = np.array([c.link in TABLE_LINKS for c in CAPSULES])
 """(C,) which capsules move about enough to meet the table or what stands on it."""
 _OBSTACLES = np.array([c.link in GRIPPER_OBSTACLES for c in CAPSULES])
 _RADII = np.array([c.radius_m for c in CAPSULES])
 _ENDS = np.array([[c.start, c.end] for c in CAPSULES])
-_PAIRS = np.array(
-    [
-        (i, j)
-        for link, others in SELF_PAIRS
-        for i, one in enumerate(CAPSULES)
-        for j, other in enumerate(CAPSULES)
-        if one.link == link and other.link in others
-    ]
-)
 _SELF_VERTICES = 400  # heads of the gripper's points that are tried against the capsules, which have 10 mm to spare
 
 
@@ -84,7 +74,7 @@ def first_arm_problem(poses: ArmPoses, table: Plane, link_margin_m: float) -> Pr
             detail=f"{CAPSULES[c].link} would be {heights[n, c] * 1e3:.0f} mm above the table; "
             f"allowed is {link_margin_m * 1e3:.0f} mm.",
         )
-    one, other = _first_capsule_pair(ends, _RADII, _PAIRS)
+    one, other = _first_capsule_pair(ends, _RADII, CAPSULE_PAIRS)
     if one >= 0:
         return Problem(reason="self", detail=f"{CAPSULES[one].link} would hit {CAPSULES[other].link}.")
     obstacles = np.ascontiguousarray(ends[:, _OBSTACLES])
