@@ -36,7 +36,9 @@ def as_set(T: np.ndarray, width_m: float = np.nan) -> GraspSet:
 
 def test_the_sampler_s_own_grasps_are_judged_much_as_the_sampler_judges_them(scorer, box_view):
     points = box_view[1]
-    grasps = DiffusionSampler().draw(points, 100, 5)  # none kept back, so good and bad ones; it scores them before their axes are made square
+    grasps = DiffusionSampler().draw(
+        points, 100, 5
+    )  # none kept back, so good and bad ones; it scores them before their axes are made square
     scores = scorer.score(points, grasps, 5)
     assert np.corrcoef(scores, grasps.scores)[0, 1] > 0.8
 
