@@ -13,18 +13,11 @@ import numpy as np
 from numba import njit
 
 from hal import z1
-from hal.limits import ServoLimits
 from hal.z1_shape import CAPSULE_PAIRS, CAPSULES, GRIPPER_OBSTACLES, HAND_POINTS, MOVER_POINTS, TABLE_LINKS
 
 _LINKS = ("link00", "link01", "link02", "link03", "link04", "link05", "link06")
-SLACK_M = 1e-3
-"""Further outside than this is outside: an arm that rests on the edge may be told to stay there [m]."""
+_SLACK_M = 1e-3  # an arm that rests on the edge may be told to stay there
 _ROUNDING_M = 1e-9  # more, and repeated attempts would creep outwards
-BRAKING_SLACK_M = 0.010
-"""The same for where the arm would come to rest if it braked now: its joints then stop each in its own time, which
-takes the hand off its line [m]."""
-
-
 _LINK = np.array([_LINKS.index(capsule.link) for capsule in CAPSULES])
 _ENDS = np.array([(capsule.start, capsule.end) for capsule in CAPSULES])
 _RADII = np.array([capsule.radius_m for capsule in CAPSULES])
@@ -86,8 +79,8 @@ class Guard:
         space = self.workspace
         return Margins(box, table - space.table_m, own - space.self_m)
 
-    def refusal(self, q: np.ndarray, q_now: np.ndarray, slack_m: float = SLACK_M) -> tuple[int, str] | None:
-        """Return the first of `q` (N, 7) that is more than `slack_m` outside and why, or None.
+    def refusal(self, q: np.ndarray, q_now: np.ndarray) -> tuple[int, str] | None:
+        """Return the first of `q` (N, 7) that is outside and why, or None.
 
         An arm that is outside already, at `q_now` (7,), may move as long as it does not get further out: else it
         could never be brought back.
@@ -95,18 +88,11 @@ class Guard:
         now, asked = self.margins(q_now[None]), self.margins(q)
         worst: tuple[int, str] | None = None
         for here, there, what in zip(now, asked, _WHAT, strict=True):
-            outside = np.flatnonzero(there < min(-slack_m, float(here[0]) - _ROUNDING_M))
+            outside = np.flatnonzero(there < min(-_SLACK_M, float(here[0]) - _ROUNDING_M))
             if len(outside) and (worst is None or outside[0] < worst[0]):
                 first = int(outside[0])
                 worst = first, what.format(f"{-1e3 * there[first]:.0f}")
         return worst
-
-
-def find_rest(limits: ServoLimits, q: np.ndarray, dq: np.ndarray) -> np.ndarray:
-    """Return where (7,) the joints come to rest from `q` (7,) at `dq` (7,), braking within acceleration and jerk."""
-    # Half the time that the acceleration takes to build up goes by at the present speed.
-    rest = q + 0.5 * dq * (np.abs(dq) / limits.ddq_max + limits.ddq_max / limits.dddq_max)
-    return np.minimum(np.maximum(rest, limits.q_min), limits.q_max)
 
 
 def _joint_placements() -> np.ndarray:

@@ -15,7 +15,7 @@ import numpy as np
 
 from hal import playback
 from hal.errors import CommandRefusedError, StoppedError
-from hal.guard import BRAKING_SLACK_M, Guard, find_rest
+from hal.guard import Guard
 from hal.lease import Lease
 from hal.limits import ServoLimits
 from hal.messages import ArmSetpoint, ArmState, ServoMode, TrajectoryChunk
@@ -191,13 +191,6 @@ class Orders:
             index, what = refusal
             raise CommandRefusedError(
                 f"trajectory {chunk.trajectory_id} {what} (t = {start_s + index * _CHECK_EVERY_S:.2f} s)."
-            )
-        # If nothing follows, the arm brakes from the last point: that has to end inside as well.
-        rest = find_rest(self._limits, chunk.q[-1], chunk.dq[-1])
-        refusal = self._guard.refusal(rest[None], snapshot.q_sent, BRAKING_SLACK_M)
-        if refusal is not None:
-            raise CommandRefusedError(
-                f"trajectory {chunk.trajectory_id} {refusal[1]}, if the arm has to brake after t = {new.end_s:.2f} s."
             )
 
     def _check_start(self, chunk: TrajectoryChunk, snapshot: Snapshot) -> None:
