@@ -74,7 +74,8 @@ class Guard:
 
     def margins(self, q: np.ndarray) -> Margins:
         """Return how far postures `q` (N, 7) [rad] stay inside; some microseconds each."""
-        q = np.ascontiguousarray(q, dtype=np.float64)
+        # A copy, writable: a read-only array is another type to the compiler, which would compile again in motion.
+        q = np.array(q, dtype=np.float64, order="C")
         box, table, own = _margins(q, self._joints, *self._corners, z1.T_FLANGE_PIVOT)
         space = self.workspace
         return Margins(box, table - space.table_m, own - space.self_m)
