@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from models.detector_weights import INPUT_HW, MAKER, load_detector, tame_ultralytics
+from models.detector_weights import CAMERA_HW, MAKER, load_detector, tame_ultralytics
 from models.torch_threads import single_threaded_workers
 from models.weights_file import WeightsError, checked_sha256, sha256_of
 
@@ -44,7 +44,7 @@ def load_module(path: Path) -> DetectorModule:
         loaded = load_detector(path)
         network, names, input_hw = loaded.network, loaded.names, loaded.input_hw
     else:
-        (network, names), input_hw = _load_checkpoint(path), INPUT_HW
+        (network, names), input_hw = _load_checkpoint(path), CAMERA_HW
     network = network.fuse(verbose=False).eval()
     for parameter in network.parameters():
         parameter.requires_grad_(False)

@@ -12,7 +12,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from models.detector_modules import MODULE_SUFFIXES, exported, load_module
-from models.detector_weights import INPUT_HW, detector_path
+from models.detector_weights import CAMERA_HW, detector_path
 from models.torch_threads import single_threaded_workers
 from models.weights_file import WeightsError
 
@@ -193,7 +193,7 @@ def _split(outputs: Sequence[Any]) -> tuple[np.ndarray, np.ndarray | None]:
 def _input_hw(shape: list[int | None], path: Path) -> tuple[int, int]:
     if len(shape) != 4 or shape[1] not in (3, None) or shape[0] not in (1, None):
         raise WeightsError(f"{path.name} takes {shape}; a detector takes one image (1, 3, H, W).")
-    return shape[2] or INPUT_HW[0], shape[3] or INPUT_HW[1]
+    return shape[2] or CAMERA_HW[0], shape[3] or CAMERA_HW[1]
 
 
 def _class_names(metadata: Mapping[str, str], path: Path) -> tuple[str, ...]:

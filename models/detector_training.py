@@ -30,23 +30,19 @@ class Phase:
     lr0: float
     """Learning rate after the warm-up."""
     lrf: float
-    """Share of `lr0` at the end; a straight line between, in steps of one epoch or, if `smooth`, of one batch."""
+    """Share of `lr0` at the end; a straight line between, in steps of one batch."""
     warmup_epochs: float
     batch: int = 8
     fraction: float = 1.0
     """Share of the training pictures that it sees, from the first."""
-    smooth: bool = False
 
 
 PHASES = (
-    Phase(imgsz=256, epochs=4, lr0=1.0e-3, lrf=0.8, warmup_epochs=0.5),
-    Phase(imgsz=320, epochs=5, lr0=8.0e-4, lrf=0.667, warmup_epochs=0.1),
-    Phase(imgsz=416, epochs=1, lr0=6.0e-4, lrf=0.6, warmup_epochs=0.1, smooth=True),
-    Phase(imgsz=320, epochs=14, lr0=1.2e-3, lrf=0.4, warmup_epochs=0.3, smooth=True),
-    Phase(imgsz=416, epochs=8, lr0=5.0e-4, lrf=0.3, warmup_epochs=0.1, smooth=True),
-    Phase(imgsz=640, epochs=2, lr0=1.5e-4, lrf=0.03, warmup_epochs=0.1, smooth=True),
+    Phase(imgsz=256, epochs=12, lr0=2.0e-3, lrf=0.7, warmup_epochs=1.0, batch=16),
+    Phase(imgsz=384, epochs=8, lr0=1.4e-3, lrf=0.25, warmup_epochs=0.2, batch=16),
+    Phase(imgsz=512, epochs=2, lr0=3.5e-4, lrf=0.05, warmup_epochs=0.1, batch=16),
 )
-"""Small pictures teach most of it at a fifth of the time; the last phase has the size at which the network is used."""
+"""Small pictures teach most of it at a fraction of the time; the last phase has the size at which the network is used."""
 
 AUGMENTATION = {
     "hsv_h": 0.03,
@@ -67,7 +63,7 @@ CARD_SHARE = 0.2
 
 
 class HideBehindCard:
-    """Hides up to 55 % of a lone object's extent behind a flat card that comes in from a random side."""
+    """Hides up to 45 % of a lone object's extent behind a flat card that comes in from a random side."""
 
     def __call__(self, labels: dict) -> dict:
         """Return ultralytics' labels with picture, outline and box changed."""
@@ -77,7 +73,7 @@ class HideBehindCard:
         outline, angle = instances.segments[0], random.uniform(0.0, 2.0 * np.pi)
         away = np.array([np.cos(angle), np.sin(angle)])
         along = outline @ away
-        edge = along.max() - random.uniform(0.1, 0.55) * (along.max() - along.min())
+        edge = along.max() - random.uniform(0.1, 0.45) * (along.max() - along.min())
         left, top, right, bottom = instances.bboxes[0] + np.array([-1, -1, 1, 1]) * random.uniform(2.0, 25.0)
         card = clip_polygon(np.array([[left, top], [right, top], [right, bottom], [left, bottom]]), -away, -edge)
         shade = random.choices(range(20, 60), k=3) if random.random() < 0.5 else random.choices(range(256), k=3)
@@ -120,9 +116,6 @@ class Bf16SegmentationModel(SegmentationModel):
 class CpuSegmentationTrainer(SegmentationTrainer):
     """Ultralytics' trainer without validation between epochs, for a network in bfloat16 and channels-last."""
 
-    smooth = False
-    """Whether the learning rate falls with every batch, not with every epoch."""
-
     def get_model(self, cfg=None, weights=None, verbose=True):
         """Return the network, with `weights` if given."""
         model = Bf16SegmentationModel(
@@ -150,11 +143,11 @@ class CpuSegmentationTrainer(SegmentationTrainer):
         return batch
 
     def optimizer_step(self) -> None:
-        """Step, in a smooth phase with the learning rate of this very batch."""
+        """Step, with the learning rate of this very batch; ultralytics' own falls once an epoch."""
         super().optimizer_step()
         batches = len(self.train_loader)
         self.steps = getattr(self, "steps", self.start_epoch * batches) + 1
-        if self.smooth and self.steps > self._get_warmup_iterations(batches):
+        if self.steps > self._get_warmup_iterations(batches):
             assert self.optimizer is not None and self.lf is not None
             for group in self.optimizer.param_groups:
                 group["lr"] = group["initial_lr"] * self.lf(self.steps / batches)
@@ -182,19 +175,13 @@ def train_phase(phase: Phase, *, data: Path, folder: Path, start: Path | None, s
     if (folder / "done").exists():
         return last
     settings = asdict(phase) | AUGMENTATION
-    smooth = settings.pop("smooth")
-    settings |= {
-        "model": f"{ARCHITECTURE}.yaml",
-        "data": str(data),
-        "seed": seed,
-        "pretrained": str(start) if start else False,
-    }
+    settings |= {"model": f"{ARCHITECTURE}.yaml", "data": str(data), "pretrained": str(start) if start else False}
     settings |= {"project": str(folder.parent), "name": folder.name, "exist_ok": True, "device": "cpu", "seed": seed}
     settings |= {"optimizer": "AdamW", "weight_decay": 0.005, "nbs": phase.batch, "momentum": 0.9, "workers": 0}
     settings |= {"rect": True, "amp": False, "val": False, "plots": False, "patience": 0, "close_mosaic": 0}
     settings |= {"warmup_bias_lr": 0.0, "deterministic": True, "resume": str(last) if last.exists() else False}
+    settings["cache"] = "ram"  # the pictures at the phase's size: 0.7 to 3 GB
     trainer = CpuSegmentationTrainer(overrides=settings)
-    trainer.smooth = smooth
     trainer.add_callback("on_train_start", lambda _: torch.set_num_threads(threads))
     trainer.train()
     (folder / "done").touch()

@@ -18,8 +18,10 @@ if TYPE_CHECKING:
 CLASSES = ("bottle", "cylinder", "box")
 """What the shipped detector tells apart, in the order of its outputs."""
 ARCHITECTURE = "yolov8n-seg"
-INPUT_HW = (480, 640)
-"""(H, W) of the images it is made for [px]: the D405's."""
+INPUT_HW = (384, 512)
+"""(H, W) to which images are scaled before it looks [px]: four fifths of the D405's, and a third faster."""
+CAMERA_HW = (480, 640)
+"""(H, W) of the D405's images [px], which other networks are shown as they are if they have no size of their own."""
 MAKER = "python -m scripts.train_detector"
 """The command that makes the weights."""
 

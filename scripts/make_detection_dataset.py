@@ -32,7 +32,7 @@ SPLITS = {"train": 1_000_000, "val": 2_000_000, "empty": 3_000_000}
 class Config:
     """How many pictures, and of what."""
 
-    train: int = 4000
+    train: int = 5000
     """Pictures to learn from."""
     val: int = 500
     """Held-out pictures."""

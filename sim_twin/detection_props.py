@@ -56,7 +56,7 @@ def make_class_prop(name: str, rng: np.random.Generator) -> Prop:
 
 
 def make_distractor(rng: np.random.Generator) -> Prop:
-    """Return a thing of no class."""
+    """Return a thing of no class, and none that looks like one: square to the lens, a plate is a box."""
     kind = list(_DISTRACTORS)[rng.integers(len(_DISTRACTORS))]
     return _DISTRACTORS[kind](rng)
 
@@ -141,11 +141,6 @@ def _make_cone(rng: np.random.Generator) -> Prop:
     return _prop("cone", _part("frustum", (radius, rng.uniform(0.002, 0.2 * radius), rng.uniform(0.03, 0.09))))
 
 
-def _make_plate(rng: np.random.Generator) -> Prop:
-    size = (rng.uniform(0.03, 0.10), rng.uniform(0.04, 0.13), rng.uniform(0.001, 0.007))
-    return _prop("plate", _part("box", size))
-
-
 def _make_disc(rng: np.random.Generator) -> Prop:
     radius = rng.uniform(0.03, 0.09)
     return _prop("disc", _part("cylinder", (radius, rng.uniform(0.03, 0.2) * radius)))
@@ -157,7 +152,7 @@ def _make_stick(rng: np.random.Generator) -> Prop:
 
 def _make_angle(rng: np.random.Generator) -> Prop:
     """An L, a T or a cross of two bars."""
-    long, short, half = rng.uniform(0.05, 0.09), rng.uniform(0.025, 0.05), rng.uniform(0.010, 0.02)
+    long, short, half = rng.uniform(0.05, 0.09), rng.uniform(0.025, 0.05), rng.uniform(0.006, 0.012)
     across = _part("box", (short, half, half))
     up = _part("box", (half, half, long))
     side, height = [(short - half, -long + half), (0.0, long - half), (0.0, 0.3 * long)][rng.integers(3)]
@@ -201,7 +196,6 @@ _DISTRACTORS: dict[str, Callable[[np.random.Generator], Prop]] = {
     "ball": _make_ball,
     "egg": _make_egg,
     "cone": _make_cone,
-    "plate": _make_plate,
     "disc": _make_disc,
     "stick": _make_stick,
     "angle": _make_angle,

@@ -17,11 +17,13 @@ from sim_twin.photo import spoil_photo
 if TYPE_CHECKING:
     from hal.messages import Intrinsics
 
-LEAST_PIXELS = 300
+LEAST_PIXELS = 600
 """An object that shows fewer pixels at 640×480 is taken out of the scene."""
-LEAST_SHARE = 0.25
+LEAST_SHARE = 0.45
 """So is one that shows less of its outline, unless it fills `_LARGE_SHARE` of the picture."""
-_LARGE_SHARE = 0.08
+_LARGE_SHARE = 0.15
+_END_ON_COS = np.cos(np.deg2rad(25))
+"""Nearer to its axis than this, a bottle or a cylinder looks like any disc."""
 
 _NEAREST_M = 0.05  # no corner of an object comes nearer to the lens
 _JAW_POINTS = ((0.05, 0, 0), (0.10, 0, 0), (0.14, 0, 0), (0.18, 0, 0), (0.20, 0, 0), (0.03, 0.14, 0))
@@ -60,11 +62,11 @@ class SceneMix:
 
     empty: float = 0.1
     """No object at all, only distractors or nothing."""
-    wrist: float = 0.6
+    wrist: float = 0.75
     """Seen by the wrist camera past the jaws; the others from anywhere."""
-    twin_look: float = 0.2
+    twin_look: float = 0.25
     """In the twin's own colours and light."""
-    occluded: float = 0.25
+    occluded: float = 0.2
     """Something put in front of the first object on purpose."""
 
 
@@ -185,10 +187,10 @@ def _random_joints(rng: np.random.Generator) -> np.ndarray:
 def _random_view(rng: np.random.Generator) -> np.ndarray:
     """A camera pose (4, 4) around the table's middle, mostly upright."""
     target = np.array([rng.uniform(0.25, 0.75), rng.uniform(-0.3, 0.3), rng.uniform(0.02, 0.15)])
-    azimuth, elevation = rng.uniform(-np.pi, np.pi), np.deg2rad(rng.triangular(-3, 15, 75))
+    azimuth, elevation = rng.uniform(-np.pi, np.pi), np.deg2rad(rng.triangular(0, 20, 60))
     c = np.cos(elevation)
     away = np.array([c * np.cos(azimuth), c * np.sin(azimuth), np.sin(elevation)])
-    place = target + rng.uniform(0.18, 0.85) * away
+    place = target + rng.uniform(0.22, 0.75) * away
     place[2] = max(place[2], 0.02)
     forward = (target - place) / np.linalg.norm(target - place)
     right = np.cross(forward, [0.0, 0.0, 1.0])
@@ -303,7 +305,7 @@ def _fits(
         return False
     corners = np.vstack(actor.prop.corners())
     depths = (corners @ pose[:3, :3].T + pose[:3, 3] - T_base_camera[:3, 3]) @ T_base_camera[:3, 2]
-    if depths.min() < _NEAREST_M:
+    if depths.min() < _NEAREST_M or _is_end_on(actor, pose, T_base_camera[:3, 3]):
         return False
     if not by_wrist:
         return True
@@ -312,6 +314,11 @@ def _fits(
     inside = (points - pose[:3, 3]) @ pose[:3, :3]
     low, high = corners.min(axis=0) - 0.012, corners.max(axis=0) + 0.012
     return not bool(np.all((inside > low) & (inside < high), axis=1).any())
+
+
+def _is_end_on(actor: Actor, pose: np.ndarray, lens: np.ndarray) -> bool:
+    ray = pose[:3, 3] - lens
+    return actor.prop.kind != "box" and abs(float(ray @ pose[:3, 2])) > _END_ON_COS * float(np.linalg.norm(ray))
 
 
 def _place_distractors(

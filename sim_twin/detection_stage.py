@@ -150,7 +150,8 @@ class Stage:
         """Give everything new colours, textures and lights."""
         self._dress_surroundings(rng)
         for number in rng.permutation(_SKINS)[:4]:  # the others keep theirs from earlier pictures
-            self._set_texture(f"skin_{number}", np.vstack([random_texture(rng, _SKIN_PX) for _ in range(6)]))
+            side = random_texture(rng, _SKIN_PX)
+            self._set_texture(f"skin_{number}", np.tile(side, (6, 1, 1)))  # six of its own make a cylinder a box
         for actor in self.actors:
             self._dress_actor(actor, rng)
         tint = np.append(rng.uniform(0.75, 1.2, 3) if rng.random() < 0.5 else np.ones(3), 1.0)

@@ -23,7 +23,7 @@ def spoil_photo(colour: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         picture = cv2.GaussianBlur(picture, (0, 0), rng.uniform(0.4, 1.6))
     if rng.random() < 0.20:
         picture = _motion_blur(picture, rng)
-    spoilt = _with_noise(picture, rng.uniform(0.5, 9.0), rng)
+    spoilt = _with_noise(picture, rng.uniform(0.5, 6.0), rng)
     if rng.random() < 0.4:
         quality = [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(35, 90))]
         decoded = cv2.imdecode(cv2.imencode(".jpg", spoilt, quality)[1], cv2.IMREAD_COLOR)
