@@ -7,12 +7,10 @@ import numpy as np
 from hal import z1
 from hal.wire.board import PERIOD_S
 from hal.wire.controller import decode_command, encode_state
-from hal.wire.records import KD_SCALE, KP_SCALE, JointStates, WireError
+from hal.wire.records import WireError
 from sim_twin.controller import Controller
+from sim_twin.motors import Motors
 from sim_twin.world import World
-
-TEMPERATURE_C = 30
-"""Of every motor, as long as nobody sets another [°C]."""
 
 _BOARD_TICKS = round(PERIOD_S / z1.CONTROL_PERIOD_S)
 
@@ -25,29 +23,32 @@ class ControlledWorld:
 
     Args:
         world: whose arm it is; who owns it calls `tick` before each of its steps.
+        ailments: a record of `sim_twin.ailments.AILMENTS`, written into from outside.
     """
 
-    def __init__(self, world: World) -> None:
+    def __init__(self, world: World, ailments: np.ndarray | None = None) -> None:
         self.world = world
-        shape = (z1.N_JOINTS, 2)
-        self.error = np.zeros(shape, dtype=np.uint8)
-        """(7, 2) `MotorError` bits; set them to break a motor."""
-        self.link = np.zeros(shape, dtype=np.uint8)
-        """(7, 2) `MotorLink`; the same."""
-        self.temperature_c = np.full(shape, TEMPERATURE_C, dtype=np.int8)
-        """(7, 2) [°C]."""
-        self.board_silent = False
-        """While it is set the motors keep their last command, and the last measurement is told."""
+        self.motors = Motors(world, ailments)
+        """While their board is silent they are told nothing, and the last measurement is told."""
         self.awake = False
         """Whether a command has come."""
         self.refused = 0
         """Datagrams that were no commands."""
         self.last_refusal = ""
         """Why the last one was none."""
-        self._dq = np.zeros(z1.N_JOINTS)
-        self._measured = self._measure()
+        self._measured = self.motors.measure()
         self.controller = Controller(self._measured)
         self._ticks = 0
+        self._heard = False
+
+    def hear(self, data: bytes | memoryview) -> None:
+        """Obey a datagram; what is answered, `tell` says."""
+        self._heard |= self.take(data)
+
+    def tell(self) -> bytes | None:
+        """Return the answer if there was a command since the last time: the controller answers in its own rhythm."""
+        heard, self._heard = self._heard, False
+        return self.answer() if heard else None
 
     def take(self, data: bytes | memoryview) -> bool:
         """Obey a datagram; False when it was refused and counted. Never raises."""
@@ -70,23 +71,11 @@ class ControlledWorld:
 
     def tick(self) -> None:
         """Let the controller work for 2 ms; to be called before each step of the world."""
-        exchange = self._ticks % _BOARD_TICKS == 0 and not self.board_silent
+        exchange = self._ticks % _BOARD_TICKS == 0 and not self.motors.silent
         self._ticks += 1
         if exchange:
-            self._measured = self._measure()
+            self._measured = self.motors.measure()
         told = self.controller.step(self._measured, z1.CONTROL_PERIOD_S)
         if exchange and self.awake:
-            self.world.set_motors(told.q, told.dq, told.tau, KP_SCALE * told.kp, KD_SCALE * told.kd)
-
-    def _measure(self) -> JointStates:
-        q, dq, tau = self.world.read_arm()
-        ddq, self._dq = (dq - self._dq) / PERIOD_S, dq
-        return JointStates(
-            q=q,
-            dq=dq,
-            ddq=ddq,
-            tau=tau,
-            temperature_c=self.temperature_c.copy(),
-            error=self.error.copy(),
-            link=self.link.copy(),
-        )
+            self.motors.obey(told)
+        self.motors.tick()

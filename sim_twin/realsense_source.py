@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from typing import Self
 
 import cv2
 import mujoco
 import numpy as np
 
-from hal.backends.d405_camera import D405Camera
-from hal.backends.d405_session import D405CameraConfig
-from hal.clock import Clock
+from hal.clock import Clock, WallClock
 from hal.d405 import BASELINE_M, DEPTH_UNIT_M, MIN_Z_M, Calibration, Exposure, Look
 from hal.messages import Intrinsics
 from sim_twin import d405
 from sim_twin.backends import give_way
 from sim_twin.clock import TwinClock
 from sim_twin.render import View, WristRenderer, camera_id, make_renderer
+from sim_twin.scene_view import SceneView
 from sim_twin.world import World
 
 
@@ -29,20 +27,22 @@ class TwinSource:
 
     Args:
         world: what it looks at.
-        clock: a `TwinClock` of that world for lock-step (the default), any other for free run.
+        clock: a `TwinClock` of that world for lock-step (the default for a `World`), any other for free run.
         renderer: one of `sim_twin.gl.RENDERERS`; by default what the environment says.
         calibration: of the unit; by default figures of real ones.
     """
 
     def __init__(
         self,
-        world: World,
+        world: SceneView,
         clock: Clock | None = None,
         renderer: str | None = None,
         calibration: Calibration | None = None,
     ) -> None:
         self.world = world
-        self.clock: Clock = clock if clock is not None else TwinClock(world)
+        if clock is None:
+            clock = TwinClock(world) if isinstance(world, World) else WallClock()
+        self.clock: Clock = clock
         self.lockstep = isinstance(self.clock, TwinClock)
         self.calibration = calibration if calibration is not None else Calibration()
         self.attached = True
@@ -139,18 +139,6 @@ class TwinSource:
         if not self.world.config.noise:
             return picture
         return d405.measure_colour(np.ascontiguousarray(picture), self.world.config.seed, 3 * look.number + imager)
-
-
-def make_camera(world: World, clock: Clock | None = None, config: D405CameraConfig | None = None) -> D405Camera:
-    """Return the real camera's driver with librealsense and the twin's optics below it, not connected.
-
-    Args:
-        world: what it looks at; it also gives the serial number.
-        clock: a `TwinClock` of that world for lock-step (the default), any other for free run.
-        config: what to stream.
-    """
-    config = replace(config if config is not None else D405CameraConfig(), serial=world.config.camera_serial())
-    return D405Camera(config, source=TwinSource(world, clock))
 
 
 class Optics:

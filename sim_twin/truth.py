@@ -16,7 +16,7 @@ from hal.clock import WallClock
 from hal.errors import HalTimeoutError
 
 if TYPE_CHECKING:
-    from sim_twin.world import World
+    from sim_twin.scene_view import SceneView
 
 _TRUTH = "eval/truth"
 _POSES = ("T_base_object", "T_flange_camera", "T_base_board")
@@ -40,7 +40,7 @@ class Truth:
     """(14,) MuJoCo's positions: joints [rad], then the object's position [m] and quaternion (wxyz)."""
 
 
-def read_truth(world: World) -> Truth:
+def read_truth(world: SceneView) -> Truth:
     """Return the truth about `world` at this moment."""
     return Truth(
         object=world.config.object,
@@ -48,7 +48,7 @@ def read_truth(world: World) -> Truth:
         lifted_m=world.lifted_m(),
         T_flange_camera=world.config.T_flange_camera(),
         T_base_board=None if world.config.board is None else world.config.board.T_base_board(),
-        qpos=world.snapshot().qpos.copy(),
+        qpos=world.poses()[1],
     )
 
 
@@ -58,7 +58,7 @@ class TruthServer:
     Pictures are left to the asker: drawing one here would take the interpreter from the servo.
     """
 
-    def __init__(self, config: BusConfig, world: World) -> None:
+    def __init__(self, config: BusConfig, world: SceneView) -> None:
         self._world = world
         self._session = open_session(config, listen=False)
         self._service = Service(self._session, _TRUTH, self._answer, on_death=lambda: None)

@@ -1,51 +1,78 @@
-"""The rig `wire-sim`: one simulated world behind both real drivers, the arm's on UDP, the camera's on librealsense."""
+"""The rig `wire-sim`: one simulated world behind both real drivers, the arm's on UDP, the camera's on librealsense.
+
+Three processes, as on a robot: the drivers here, controller and physics in the second, the camera's optics in the
+third. In one of them, a thread that draws at low priority would hold the interpreter's lock that the arm waits for.
+"""
 
 from __future__ import annotations
 
 import socket
+from dataclasses import replace
 from typing import Any
 
+from hal.backends.d405_camera import D405Camera
+from hal.backends.d405_session import D405CameraConfig
 from hal.backends.z1_arm import Z1Arm
 from hal.backends.z1_config import Z1ArmConfig, Z1Mode
 from hal.clock import Clock, WallClock
+from hal.errors import HalError
+from hal.messages import ArmState
 from hal.rig import Rig
-from sim_twin.controlled_world import ControlledWorld
-from sim_twin.realsense_source import make_camera
+from sim_twin.camera_process import RemoteSource
 from sim_twin.scene import SceneConfig
-from sim_twin.wire_server import WireConfig, WireServer
-from sim_twin.world import World
+from sim_twin.wire_config import WireConfig
+from sim_twin.wire_process import WireProcess
 
 _LOOPBACK = "127.0.0.1"
+_DYING_S = 0.2
 
 
 class WiredArm(Z1Arm):
-    """The real driver, with the controller that it talks to: that one runs while this one is connected.
+    """The real driver, and the controller that it talks to: that one is started when this one is connected.
 
     Args:
-        server: the controller.
+        twin: the controller.
         clock: the wall's.
         mode: how the arm is commanded.
     """
 
-    def __init__(self, server: WireServer, clock: Clock, mode: Z1Mode = Z1Mode.TRACKING) -> None:
-        c = server.config
+    def __init__(self, twin: WireProcess, clock: Clock, mode: Z1Mode = Z1Mode.TRACKING) -> None:
+        w = twin.wire
         config = Z1ArmConfig(
-            host=c.host, command_port=c.command_port, local_host=c.client_host, state_port=c.state_port, mode=mode
+            host=w.host, command_port=w.command_port, local_host=w.client_host, state_port=w.state_port, mode=mode
         )
         super().__init__(clock, config)
-        self.server = server
+        self.twin = twin
 
     def connect(self) -> None:
-        self.server.start()
+        self.twin.start()
+        super().connect()
+
+    def read_state(self) -> ArmState:
         try:
-            super().connect()
-        except BaseException:
-            self.server.stop()
+            return super().read_state()
+        except HalError as error:
+            if ended := self.twin.why_it_ended(_DYING_S):
+                raise HalError(ended) from error
             raise
 
-    def disconnect(self) -> None:
-        super().disconnect()
-        self.server.stop()
+
+class WiredCamera(D405Camera):
+    """The real driver, and the optics that it looks through: those are started when this one is connected.
+
+    Args:
+        twin: what it looks at.
+        config: what to stream.
+    """
+
+    def __init__(self, twin: WireProcess, config: D405CameraConfig | None = None) -> None:
+        config = replace(config if config is not None else D405CameraConfig(), serial=twin.config.camera_serial())
+        self.optics = RemoteSource(twin)
+        super().__init__(config, source=self.optics)
+
+    def connect(self) -> None:
+        self.optics.warm_up(self.config.width, self.config.height)  # seconds: no camera would be waited for so long
+        super().connect()
 
 
 def make_wire_rig(scene: SceneConfig | None = None, mode: Z1Mode = Z1Mode.TRACKING, **_: Any) -> Rig:
@@ -57,11 +84,10 @@ def make_wire_rig(scene: SceneConfig | None = None, mode: Z1Mode = Z1Mode.TRACKI
         **_: options of other rigs.
     """
     clock = WallClock()
-    world = World(scene if scene is not None else SceneConfig())
     command_port, state_port = free_ports()
-    config = WireConfig(host=_LOOPBACK, command_port=command_port, client_host=_LOOPBACK, state_port=state_port)
-    server = WireServer(ControlledWorld(world), config, clock)
-    return Rig(arm=WiredArm(server, clock, mode), camera=make_camera(world, clock), clock=clock, world=world)
+    wire = WireConfig(host=_LOOPBACK, command_port=command_port, client_host=_LOOPBACK, state_port=state_port)
+    twin = WireProcess(scene if scene is not None else SceneConfig(), wire)
+    return Rig(arm=WiredArm(twin, clock, mode), camera=WiredCamera(twin), clock=clock, world=twin)
 
 
 def free_ports() -> tuple[int, int]:

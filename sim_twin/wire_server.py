@@ -1,4 +1,4 @@
-"""The twin behind the ports of the vendor's controller, in real time."""
+"""The twin behind the ports of the vendor's controller, or of the arm board below it, in real time."""
 
 from __future__ import annotations
 
@@ -6,17 +6,20 @@ import contextlib
 import errno
 import logging
 import os
+import select
 import socket
 import sys
 import threading
-from dataclasses import dataclass
-from typing import Self
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Protocol, Self
 
 from hal.clock import Clock, WallClock
 from hal.errors import HalError, LeaseError
-from hal.wire.controller import COMMAND_PORT, STATE_PORT
 from hal.z1 import CONTROL_PERIOD_S
-from sim_twin.controlled_world import ControlledWorld
+from sim_twin.wire_config import WireConfig
+
+if TYPE_CHECKING:
+    from sim_twin.world import World
 
 log = logging.getLogger(__name__)
 
@@ -26,45 +29,57 @@ _MOST_AT_ONCE = 1024
 _LARGEST = 2048
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class WireConfig:
-    """Where the controller is and whom it answers; another arm needs another pair of ports."""
+class WiredWorld(Protocol):
+    """A simulated arm behind a wire: `sim_twin.controlled_world.ControlledWorld`, `sim_twin.arm_board.ArmBoard`."""
 
-    host: str = "127.0.0.1"
-    """The address to listen on; 0.0.0.0 for all of this machine's."""
-    command_port: int = COMMAND_PORT
-    """The port to listen on."""
-    client_host: str = "127.0.0.1"
-    """The client's machine."""
-    state_port: int = STATE_PORT
-    """The client's port."""
+    world: World
+    refused: int
+    """Datagrams that could not be obeyed."""
+    last_refusal: str
+    """Why the last one could not."""
 
-    def __post_init__(self) -> None:
-        for name in ("command_port", "state_port"):
-            if not 0 < getattr(self, name) < 65536:
-                raise ValueError(f"{name} is {getattr(self, name)}; allowed are 1 to 65535.")
+    def hear(self, data: bytes | memoryview) -> bytes | None:
+        """Obey a datagram; return what is answered at once, to whoever sent it. Never raises."""
+        ...
+
+    def tick(self) -> None:
+        """Let 2 ms pass; called before each step of the world."""
+        ...
+
+    def tell(self) -> bytes | None:
+        """Return what is told to the client in this period, if anything."""
+        ...
 
 
 class WireServer:
     """A thread that hears commands, moves the world, and answers, every 2 ms; in a `with` block, or by `start` and
     `stop`.
 
-    As the vendor's it obeys whoever sends a command, and answers to one address only: a second client cannot have
-    its port. It answers in those of its periods in which a command came, and when the client is gone the arm does
-    what it was told last. Datagrams that are no commands are counted and dropped.
+    As the vendor's it obeys whoever sends a command. The controller answers to one address only, which a second
+    client cannot have, in those of its periods in which a command came; the board answers every single datagram at
+    once. When the client is gone the arm does what it was told last. Datagrams that are no commands are counted and
+    dropped.
 
     Args:
-        twin: the arm and its controller.
+        twin: the arm, and what stands before it.
         config: where it is.
         clock: the wall's.
+        on_step: called after every step of the world.
     """
 
-    def __init__(self, twin: ControlledWorld, config: WireConfig | None = None, clock: Clock | None = None) -> None:
+    def __init__(
+        self,
+        twin: WiredWorld,
+        config: WireConfig | None = None,
+        clock: Clock | None = None,
+        on_step: Callable[[], None] = lambda: None,
+    ) -> None:
         self.twin = twin
         self.config = config or WireConfig()
         self.answers = 0
         """Answers sent."""
         self._clock = clock or WallClock()
+        self._on_step = on_step
         self._buffer = memoryview(bytearray(_LARGEST))
         self._end = threading.Event()
         self._thread: threading.Thread | None = None
@@ -112,7 +127,7 @@ class WireServer:
         self.stop()
 
     def _open(self) -> socket.socket:
-        host, port = self.config.host, self.config.command_port
+        host, port = self.config.host, self.config.port
         inlet = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
             inlet.setblocking(False)
@@ -121,8 +136,8 @@ class WireServer:
             inlet.close()
             if error.errno == errno.EADDRINUSE:
                 raise LeaseError(
-                    f"port {host}:{port} is taken: another controller runs here already (`ss -lunp 'sport = :{port}'` "
-                    f"names it). End it, or choose another pair of ports."
+                    f"port {host}:{port} is taken: another {self.config.depth} runs here already "
+                    f"(`ss -lunp 'sport = :{port}'` names it). End it, or choose other ports."
                 ) from error
             raise HalError(
                 f"cannot listen on {host}:{port}: {error.strerror or error}. Choose an address of this machine."
@@ -136,36 +151,42 @@ class WireServer:
                 self._serve(inlet)
         except Exception as error:  # of every kind: who waits for answers has to learn why there are none
             self._error = error
-            log.exception("the twin's controller failed")
+            log.exception("the twin's %s failed", self.config.depth)
 
     def _serve(self, inlet: socket.socket) -> None:
         deadline_s = self._clock.now_s()
+        client = (self.config.client_host, self.config.state_port)
         while not self._end.is_set():
-            self._clock.sleep_until(deadline_s)
+            self._listen(inlet, deadline_s)
             late_s = self._clock.now_s() - deadline_s
             # What is later than this is dropped: the world slows down then, and never bursts.
             deadline_s += CONTROL_PERIOD_S + max(late_s - _MAX_CATCH_UP_S, 0.0)
-            heard = self._hear(inlet)
             self.twin.tick()
             self.twin.world.step()
-            if heard:
-                self._answer(inlet)
+            self._on_step()
+            self._send(inlet, self.twin.tell(), client)
 
-    def _hear(self, inlet: socket.socket) -> bool:
-        heard = False
+    def _listen(self, inlet: socket.socket, until_s: float) -> None:
+        while (left_s := until_s - self._clock.now_s()) > 0.0:
+            if select.select([inlet], [], [], left_s)[0]:
+                self._hear(inlet)
+        self._hear(inlet)
+
+    def _hear(self, inlet: socket.socket) -> None:
         for _ in range(_MOST_AT_ONCE):
             try:
-                size = inlet.recv_into(self._buffer)
+                size, sender = inlet.recvfrom_into(self._buffer)
             except BlockingIOError:
                 break
             except OSError:  # an answer of before reached nobody; the next datagram is still there
                 continue
-            heard |= self.twin.take(self._buffer[:size])
-        return heard
+            self._send(inlet, self.twin.hear(self._buffer[:size]), sender)
 
-    def _answer(self, inlet: socket.socket) -> None:
+    def _send(self, inlet: socket.socket, data: bytes | None, to: tuple[str, int]) -> None:
+        if data is None:
+            return
         try:
-            inlet.sendto(self.twin.answer(), (self.config.client_host, self.config.state_port))
+            inlet.sendto(data, to)
             self.answers += 1
         except OSError as error:
             log.debug("an answer could not leave: %s", error)
@@ -174,7 +195,7 @@ class WireServer:
 def _hurry() -> None:
     """Ask for real time for this thread, as a controller of its own would have it; go on without what is not permitted.
 
-    Below the servo's thread, which may live in this process and waits for the answers.
+    Below the servo's thread, which waits for the answers.
     """
     if sys.platform == "linux":
         with contextlib.suppress(OSError):

@@ -9,8 +9,8 @@ import numpy as np
 
 from hal import z1
 from sim_twin.fixture import Fixture
-from sim_twin.objects import OBJECTS
 from sim_twin.scene import PHYSICS_PERIOD_S, SceneConfig, build_model
+from sim_twin.scene_view import SceneView
 
 GRIPPER_START_RAD = -1.0
 KP_MOTOR_MAX, KD_MOTOR_MAX = 1e4, 1e3
@@ -21,7 +21,7 @@ _SUBSTEPS = round(z1.CONTROL_PERIOD_S / PHYSICS_PERIOD_S)
 _SETTLE_STEPS = 100
 
 
-class World:
+class World(SceneView):
     """Physics behind a lock: one thread steps it, others may take snapshots.
 
     The arm starts at home with the jaws open by 1 rad; the object has settled.
@@ -32,13 +32,12 @@ class World:
     """
 
     def __init__(self, config: SceneConfig, q_start: np.ndarray | None = None) -> None:
-        self.config = config
-        self.model = build_model(config)
+        super().__init__(config)
+        self._model = build_model(config)
         self.data = mujoco.MjData(self.model)
         self._lock = threading.RLock()
         self._steps = 0
-        self._corners = OBJECTS[config.object].corners()
-        self._fixture = Fixture(self.model) if config.pitch_deg != 0 else None
+        self._fixture = Fixture(self.model) if config.is_held else None
         self._gravcomp = self.model.body_gravcomp.copy()
         start = np.append(z1.Q_HOME, GRIPPER_START_RAD) if q_start is None else q_start
         self.data.qpos[: z1.N_JOINTS] = start
@@ -47,7 +46,12 @@ class World:
             self.step()
         self._steps, self.data.time = 0, 0.0
         mujoco.mj_forward(self.model, self.data)
-        self._start_height_m = self._lowest_m()
+        self.start_height_m = self.lowest_m()
+
+    @property
+    def model(self) -> mujoco.MjModel:
+        """What MuJoCo computes with."""
+        return self._model
 
     @property
     def time_s(self) -> float:
@@ -73,7 +77,16 @@ class World:
             self._set_servos(z1.KP, z1.KD, self._gravcomp)
             self.data.ctrl[:] = z1.KP * q + z1.KD * dq
 
-    def set_motors(self, q: np.ndarray, dq: np.ndarray, tau: np.ndarray, kp: np.ndarray, kd: np.ndarray) -> None:
+    def set_motors(
+        self,
+        q: np.ndarray,
+        dq: np.ndarray,
+        tau: np.ndarray,
+        kp: np.ndarray,
+        kd: np.ndarray,
+        *,
+        tau_max: np.ndarray = z1.TAU_MAX,
+    ) -> None:
         """Let each motor make tau + kp · (q − q_measured) + kd · (dq − dq_measured), up to its effort limit; nothing
         carries the arm besides.
 
@@ -83,13 +96,17 @@ class World:
             tau: (7,) [Nm].
             kp: (7,) [Nm/rad]; from 0 to `KP_MOTOR_MAX`, beyond which physics would not be stable.
             kd: (7,) [Nm s/rad]; from 0 to `KD_MOTOR_MAX`.
+            tau_max: (7,) the effort limits [Nm].
         """
         kp, kd = np.clip(kp, 0.0, KP_MOTOR_MAX), np.clip(kd, 0.0, KD_MOTOR_MAX)
         with self._lock:
-            self._set_servos(kp, kd, 0.0)
+            self._set_servos(kp, kd, 0.0, tau_max)
             self.data.ctrl[:] = np.clip(tau + kp * q + kd * dq, -_CTRL_MAX, _CTRL_MAX)
 
-    def _set_servos(self, kp: np.ndarray, kd: np.ndarray, gravcomp: np.ndarray | float) -> None:
+    def _set_servos(
+        self, kp: np.ndarray, kd: np.ndarray, gravcomp: np.ndarray | float, tau_max: np.ndarray = z1.TAU_MAX
+    ) -> None:
+        self.model.jnt_actfrcrange[: z1.N_JOINTS] = np.stack([-tau_max, tau_max], axis=1)
         self.model.actuator_biasprm[:, 1] = -kp
         self.model.actuator_biasprm[:, 2] = -kd
         self.model.body_gravcomp[:] = gravcomp
@@ -100,40 +117,12 @@ class World:
             n = z1.N_JOINTS
             return self.data.qpos[:n].copy(), self.data.qvel[:n].copy(), self.data.qfrc_actuator[:n].copy()
 
-    def T_base_object(self) -> np.ndarray:
-        """Return the object's pose (4, 4): origin at mid-height on its axis, z along the axis."""
+    def poses(self) -> tuple[float, np.ndarray]:
+        """Return MuJoCo's time [s] and positions (14 + 7 N,), as `SceneView.poses` says."""
         with self._lock:
-            pose = np.eye(4)
-            position, quat = self.data.qpos[z1.N_JOINTS : z1.N_JOINTS + 3], self.data.qpos[z1.N_JOINTS + 3 :]
-            rotation = np.empty(9)
-            mujoco.mju_quat2Mat(rotation, quat)
-            pose[:3, :3], pose[:3, 3] = rotation.reshape(3, 3), position
-            return pose
-
-    def lifted_m(self) -> float:
-        """Return how much higher the object's lowest point is than at the start [m]."""
-        return float(self._lowest_m() - self._start_height_m)
+            return float(self.data.time), self.data.qpos.copy()
 
     @property
     def fixture_holds(self) -> bool:
         """True while the break-away fixture of a leaning object has not let go."""
         return self._fixture is not None
-
-    def snapshot(self, into: mujoco.MjData | None = None) -> mujoco.MjData:
-        """Return the present poses in a copy of the state that no step will touch.
-
-        Args:
-            into: an earlier snapshot to write over, to save the allocation.
-        """
-        copy = into if into is not None else mujoco.MjData(self.model)
-        with self._lock:
-            copy.qpos[:] = self.data.qpos
-            copy.time = self.data.time
-        mujoco.mj_kinematics(self.model, copy)
-        mujoco.mj_comPos(self.model, copy)
-        mujoco.mj_camlight(self.model, copy)
-        return copy
-
-    def _lowest_m(self) -> float:
-        pose = self.T_base_object()
-        return float((self._corners @ pose[2, :3]).min() + pose[2, 3])

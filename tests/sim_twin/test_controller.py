@@ -429,12 +429,12 @@ def test_every_second_answer_repeats_the_measurement(twin: ControlledWorld) -> N
 def test_a_silent_board_leaves_stale_answers_and_is_recovered_from(twin: ControlledWorld) -> None:
     twin.take(encode_command(Fsm.INVALID))  # in PASSIVE it sinks
     run(twin, 0.1)
-    twin.board_silent = True
+    twin.motors.silent = True
     run(twin, 0.01)
     stale = twin.answer()
     run(twin, 0.5)
     assert twin.answer() == stale
-    twin.board_silent = False
+    twin.motors.silent = False
     run(twin, 0.01)
     assert twin.answer() != stale
 

@@ -16,7 +16,7 @@ from hal.clock import WallClock
 from hal.d405 import BASELINE_M, DEPTH_UNIT_M, MIN_Z_M, Exposure, Look
 from hal.messages import Intrinsics
 from sim_twin.board import BoardSpec
-from sim_twin.realsense_source import Optics, TwinSource, make_camera
+from sim_twin.realsense_source import Optics, TwinSource
 from sim_twin.render import View, make_renderer
 from sim_twin.scene import SceneConfig
 from sim_twin.world import World
@@ -80,11 +80,11 @@ def test_depth_is_exactly_what_its_pinhole_sees(patchwork: World) -> None:
 @needs_egl
 @needs_librealsense
 def test_the_driver_undistorts_colour_onto_depth_to_a_fraction_of_a_pixel(patchwork: World) -> None:
-    camera = make_camera(patchwork, config=D405CameraConfig(warm_up_s=0.0))
+    camera = D405Camera(D405CameraConfig(serial="twin", warm_up_s=0.0), source=TwinSource(patchwork))
     camera.connect()
     frame = camera.wait_for_frame(1.0)
     camera.disconnect()
-    assert frame.serial == patchwork.config.camera_serial()
+    assert frame.serial == "twin"
     corners, wrong = shifts(grey(exact(patchwork, frame.intrinsics).colour), grey(frame.colour))
     assert len(corners) > 150
     assert np.ptp(corners, axis=0) @ [1 / 640, 1 / 480] > 1.7  # all over the picture

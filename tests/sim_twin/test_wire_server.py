@@ -10,18 +10,17 @@ import pytest
 
 from hal import z1
 from hal.backends.z1_arm import Z1Arm
-from hal.backends.z1_config import Z1ArmConfig, Z1Mode
+from hal.backends.z1_config import Z1ArmConfig
 from hal.clock import WallClock
 from hal.errors import HalError, LeaseError
-from hal.messages import ArmSetpoint
-from hal.rig import RIGS
 from hal.wire.controller import LABELS, decode_state, encode_command
-from hal.wire.records import JointCommands, MotorError
+from hal.wire.records import JointCommands
 from hal.wire.states import Fsm
 from sim_twin.controlled_world import ControlledWorld
 from sim_twin.scene import SceneConfig
-from sim_twin.wire_rig import WiredArm, free_ports, make_wire_rig
-from sim_twin.wire_server import WireConfig, WireServer
+from sim_twin.wire_config import WireConfig
+from sim_twin.wire_rig import free_ports
+from sim_twin.wire_server import WireServer
 from sim_twin.world import World
 
 
@@ -126,6 +125,16 @@ def test_it_can_be_started_again_and_twice(server: WireServer) -> None:
         assert len(client.exchange(encode_command(Fsm.INVALID))) == 208
 
 
+def test_the_world_moves_while_nobody_speaks() -> None:
+    steps: list[int] = []
+    with make_server() as server:
+        server.stop()
+        counting = WireServer(server.twin, server.config, on_step=lambda: steps.append(1))
+        with counting:
+            await_true(lambda: len(steps) > 20)
+    assert server.twin.world.time_s >= 0.002 * 20
+
+
 def test_what_ends_its_thread_is_told_by_stop() -> None:
     server = make_server()
     server.twin.world.step = lambda: 1 / 0  # pyright: ignore[reportAttributeAccessIssue] - a world that fails
@@ -136,38 +145,6 @@ def test_what_ends_its_thread_is_told_by_stop() -> None:
 
 
 # --- The real driver ------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture(params=[Z1Mode.TRACKING, Z1Mode.LOW_LEVEL])
-def arm(request: pytest.FixtureRequest) -> Iterator[WiredArm]:
-    rig = make_wire_rig(mode=request.param)
-    assert isinstance(rig.arm, WiredArm)
-    rig.arm.connect()
-    yield rig.arm
-    rig.arm.disconnect()
-    assert not rig.arm.server.alive
-
-
-def test_the_real_driver_moves_the_twin(arm: WiredArm) -> None:
-    goal = np.append(z1.Q_HOME, -1.0)
-    goal[0] += 0.3
-
-    def there() -> bool:
-        arm.send(ArmSetpoint(q=goal, dq=np.zeros(z1.N_JOINTS)))
-        return abs(arm.read_state().q[0] - goal[0]) < 0.02
-
-    await_true(there)
-    assert arm.read_state().q == pytest.approx(goal, abs=0.03)
-    assert arm.read_state().faults == ()
-
-
-def test_the_real_driver_reads_the_twins_faults() -> None:
-    arm = make_wire_rig().arm
-    assert isinstance(arm, WiredArm)
-    arm.connect()
-    arm.server.twin.error[1, 1] = MotorError.OVERHEAT
-    await_true(lambda: "joint2 motor 2: overheat" in arm.read_state().faults)
-    arm.disconnect()
 
 
 def test_two_arms_live_on_two_pairs_of_ports() -> None:
@@ -183,11 +160,3 @@ def test_two_arms_live_on_two_pairs_of_ports() -> None:
         assert arms[1].read_state().q[:6] == pytest.approx(z1.Q_HOME, abs=0.05)
         for arm in arms:
             arm.disconnect()
-
-
-def test_the_rig_is_known_by_its_name() -> None:
-    rig = RIGS.make("wire-sim", scene=SceneConfig(object="box"))
-    assert isinstance(rig.arm, WiredArm)
-    assert rig.world.config.object == "box"
-    assert rig.call_every_tick is None
-    rig.arm.disconnect()
