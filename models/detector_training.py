@@ -42,7 +42,7 @@ PHASES = (
     Phase(imgsz=384, epochs=8, lr0=1.4e-3, lrf=0.25, warmup_epochs=0.2, batch=16),
     Phase(imgsz=512, epochs=2, lr0=3.5e-4, lrf=0.05, warmup_epochs=0.1, batch=16),
 )
-"""Small pictures teach most of it at a fraction of the time; the last phase has the size at which the network is used."""
+"""Small pictures teach most of it at a fraction of the time; the last have the size at which the network is used."""
 
 AUGMENTATION = {
     "hsv_h": 0.03,

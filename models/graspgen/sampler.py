@@ -132,7 +132,7 @@ class DiffusionSampler:
         for points in checked:
             rng = np.random.default_rng(seed)
             seen.append(prepare_cloud(points, rng))
-            noise.append(self.config.temperature * rng.standard_normal((n, N_COORDINATES)))
+            noise.append(self.config.temperature * even_normal(n, N_COORDINATES, rng))
         inputs = np.stack([np.concatenate([cloud.points, cloud.normals], axis=1) for cloud in seen])
         return list(zip(seen, *self._denoise(inputs, np.stack(noise)), strict=True))
 
@@ -161,6 +161,18 @@ class DiffusionSampler:
         T, widths, scores = (np.concatenate(parts) for parts in zip(*self._workers.map(denoise, jobs), strict=True))
         shape = noise.shape[:2]
         return T.reshape(*shape, 4, 4), widths.reshape(shape), scores.reshape(shape)
+
+
+def even_normal(n: int, dimensions: int, rng: np.random.Generator) -> np.ndarray:
+    """Return standard normal noise (n, dimensions) that fills its space more evenly than independent draws.
+
+    A scrambled Sobol sequence: denoising is deterministic, so evenly spread noise covers more kinds of grasps.
+    """
+    from scipy.special import ndtri
+    from scipy.stats.qmc import Sobol
+
+    sequence = Sobol(dimensions, scramble=True, rng=rng).random_base2(max(n - 1, 1).bit_length())[:n]
+    return ndtri(np.clip(sequence, 1e-6, 1.0 - 1e-6))
 
 
 def _checked(clouds: Sequence[np.ndarray], n: int) -> list[np.ndarray]:

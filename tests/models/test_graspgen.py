@@ -7,9 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from scipy.special import ndtr
+from scipy.stats.qmc import discrepancy
 
 from models.graspgen.labels import GRIPPERS, check_grasps
-from models.graspgen.sampler import DiffusionConfig, DiffusionSampler
+from models.graspgen.sampler import DiffusionConfig, DiffusionSampler, even_normal
 from models.graspgen.selection import choose_grasps
 from models.graspgen.shapes import make_shape
 from models.graspgen.views import ViewConfig, render_view
@@ -97,6 +99,21 @@ def test_of_many_alike_the_best_go_first_and_the_best_of_another_kind_is_not_for
     scores = np.append(np.linspace(0.9, 0.8, 10), 0.5)
     assert choose_grasps(T, scores, 3).tolist() == [0, 1, 10]  # the third of a kind is worth its score, no more
     assert choose_grasps(T, scores, 11).tolist() == list(range(11))
+
+
+@pytest.mark.parametrize("n", [1, 7, 800])
+def test_noise_is_normal_and_of_the_seed(n):
+    noise = even_normal(n, 10, np.random.default_rng(3))
+    assert noise.shape == (n, 10)
+    assert np.isfinite(noise).all()
+    assert (noise == even_normal(n, 10, np.random.default_rng(3))).all()
+    assert (noise != even_normal(n, 10, np.random.default_rng(4))).any()
+
+
+def test_noise_fills_its_space_more_evenly_than_independent_draws():
+    even, independent = even_normal(800, 10, np.random.default_rng(0)), np.random.default_rng(0).normal(size=(800, 10))
+    assert discrepancy(ndtr(even)) < 0.5 * discrepancy(ndtr(independent))
+    assert even.std(axis=0) == pytest.approx(np.ones(10), abs=0.05)
 
 
 def test_several_objects_get_what_each_would_get_alone(sampler):
