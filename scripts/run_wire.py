@@ -1,35 +1,43 @@
-"""The twin's Z1 in place of the vendor's controller: programs for a real Z1 drive it over UDP.
+"""The twin's Z1 in place of the real one: programs for a real Z1 drive it over UDP.
 
-    ./z1 twin wire                                             answers at 127.0.0.1:8071, to port 8072
+    ./z1 twin wire                                             as `z1_ctrl`: listens on 8071, answers to port 8072
     ./z1 twin wire --command-port 8073 --state-port 8074       a second arm
+    ./z1 twin wire --depth board                               as the arm's board: the vendor's `z1_ctrl` drives it on
+                                                               8880, with this machine's address in its config.xml
+    ./z1 twin wire --view                                      seen in Rerun
 
 Stop it with Ctrl-C.
 """
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from threading import Event
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from hal.errors import HalError
 from hal.process import stop_on_signals
 from scripts.run_hal import READY
-from sim_twin.wire_server import WireConfig
+from sim_twin.wire_config import WireConfig
 
 if TYPE_CHECKING:
-    from sim_twin.wire_server import WireServer
+    import numpy as np
+
+    from sim_twin.scene import SceneConfig
+    from sim_twin.wire_process import WireProcess
 
 _LOOK_S = 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
 class Config:
-    """Where it answers, how the arm lies, and what stands on the table."""
+    """What it stands for, where it answers, how the arm lies, and what stands on the table."""
 
     wire: Annotated[WireConfig, tyro.conf.arg(name="")] = field(default_factory=WireConfig)
-    """Where it answers."""
+    """What it stands for, and where."""
     start: Literal["startFlat", "home"] = "startFlat"
     """How the arm lies until the first command comes: folded, as the real one is switched on, or looking ahead."""
     object: str = "bottle"
@@ -40,44 +48,71 @@ class Config:
     """How far to the left [m]."""
     pitch_deg: float = 0.0
     """Lean about the base's y axis [°]."""
+    view: bool = False
+    """Show it live in Rerun."""
+    view_port: int = 9876
+    """TCP port of the live view; a second arm needs another."""
 
 
 def main(arguments: list[str]) -> int:
     """Answer until told to stop."""
+    from sim_twin.wire_process import WireProcess
+
     config = tyro.cli(Config, prog="z1 twin wire", description=__doc__, args=arguments)
+    wire = config.wire
+    twin = WireProcess(make_scene(config), wire, start_pose(config))
     stop_event = Event()
     stop_on_signals(stop_event)
-    with make_server(config) as server:
-        wire = config.wire
-        print(f"the twin's Z1 listens on {wire.host}:{wire.command_port} and answers to", end=" ")
-        print(f"{wire.client_host}:{wire.state_port}; Ctrl-C ends it.\n{READY}", flush=True)
-        while not stop_event.wait(_LOOK_S) and server.alive:
+    with ExitStack() as undo:
+        twin.start()
+        undo.callback(twin.close)
+        to = "whoever asks" if wire.depth == "board" else f"{wire.client_host}:{wire.state_port}"
+        print(f"the twin's {wire.depth} listens on {wire.host}:{wire.port} and answers to {to}; Ctrl-C ends it.")
+        print(READY, flush=True)
+        if config.view:
+            _show(twin, config.view_port, stop_event)
+        while not stop_event.wait(_LOOK_S) and twin.alive:
             pass
-    twin = server.twin
-    why = f" (the last one: {twin.last_refusal})" if twin.refused else ""
-    print(f"{server.answers} answers; {twin.refused} datagrams were no commands{why}")
+        if ended := twin.why_it_ended():
+            raise HalError(ended)
+        account = twin.account()
+    why = f" (the last one: {account['last_refusal']})" if account["refused"] else ""
+    print(f"{account['answers']} answers; {account['refused']} datagrams were no commands{why}")
     return 0
 
 
-def make_server(config: Config) -> WireServer:
-    """Return the twin that `config` describes, not yet started.
+def make_scene(config: Config) -> SceneConfig:
+    """Return the scene that `config` describes.
 
     Raises:
-        ValueError: the scene is out of range.
+        ValueError: it is out of range.
     """
-    import numpy as np
-
-    from hal.wire.controller import LABELS
-    from sim_twin.controlled_world import ControlledWorld
     from sim_twin.scene import SceneConfig
-    from sim_twin.wire_server import WireServer
-    from sim_twin.world import World
 
-    scene = SceneConfig(
+    return SceneConfig(
         object=config.object,
         distance_m=config.distance_m,
         lateral_m=config.lateral_m,
         pitch_deg=config.pitch_deg,
     )
-    q_start = np.append(LABELS["startFlat"], 0.0) if config.start == "startFlat" else None
-    return WireServer(ControlledWorld(World(scene, q_start)), config.wire)
+
+
+def start_pose(config: Config) -> np.ndarray | None:
+    """Return where the arm starts, (7,) [rad]; None = at home."""
+    import numpy as np
+
+    from hal.wire.controller import LABELS
+
+    return np.append(LABELS["startFlat"], 0.0) if config.start == "startFlat" else None
+
+
+def _show(twin: WireProcess, port: int, stop_event: Event) -> None:
+    """Show the twin until `stop_event` is set, or it is gone."""
+    from scripts.twin_view import RATE_HZ, TwinView
+
+    view = TwinView(twin, port=port)
+    try:
+        while not stop_event.wait(1.0 / RATE_HZ) and twin.alive:
+            view.update()
+    finally:
+        view.close()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import socket
 import subprocess
@@ -16,7 +17,8 @@ from hal.wire.controller import LABELS, decode_state, encode_command
 from hal.wire.states import Fsm
 from scripts.run_demo import LIFTED_M
 from scripts.run_demo import Config as DemoConfig
-from scripts.run_wire import Config, make_server
+from scripts.run_wire import Config, make_scene, start_pose
+from sim_twin.wire_process import make_twin
 from sim_twin.wire_rig import free_ports
 
 
@@ -49,8 +51,9 @@ def test_a_client_is_answered_until_somebody_ends_it(spelling: str) -> None:
 
 
 def test_the_folded_arm_rests_on_itself_in_passive() -> None:
-    twin = make_server(Config()).twin
-    twin.take(encode_command(Fsm.INVALID))
+    config = Config()
+    twin = make_twin(make_scene(config), config.wire, start_pose(config))
+    twin.hear(encode_command(Fsm.INVALID))
     for _ in range(1000):
         twin.tick()
         twin.world.step()
@@ -60,7 +63,37 @@ def test_the_folded_arm_rests_on_itself_in_passive() -> None:
 
 
 def test_home_is_where_the_camera_looks_from() -> None:
-    assert make_server(Config(start="home", object="box")).twin.world.read_arm()[0][1] == pytest.approx(1.085, abs=0.01)
+    config = Config(start="home", object="box")
+    twin = make_twin(make_scene(config), config.wire, start_pose(config))
+    assert twin.world.read_arm()[0][1] == pytest.approx(1.085, abs=0.01)
+
+
+def test_as_board_it_is_checked_and_driven_by_a_controller_and_seen_in_rerun() -> None:
+    port, view_port = free_ports()
+    options = ["--depth=board", f"--board-port={port}", "--view", f"--view-port={view_port}"]
+    command = [sys.executable, "-P", "-m", "scripts.cli", "twin", "wire", *options]
+    with (
+        socket.socket(type=socket.SOCK_DGRAM) as controller,
+        subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process,
+    ):
+        assert process.stdout is not None
+        assert process.stderr is not None
+        try:
+            assert f"board listens on 127.0.0.1:{port}" in process.stdout.readline()
+            assert process.stdout.readline() == "ready\n"
+            controller.settimeout(20.0)
+            controller.connect(("127.0.0.1", port))
+            controller.send(b"\x02")
+            assert controller.recv(4096) == bytes.fromhex("20 08 01 01 01 01 01 01 01 01")
+            controller.send(bytes(140))
+            assert len(controller.recv(4096)) == 154
+            if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+                assert f"127.0.0.1:{view_port}" in process.stderr.readline()  # where to look at it
+            process.send_signal(signal.SIGINT)
+            assert process.stdout.read() == "2 answers; 0 datagrams were no commands\n"
+            assert process.wait(20.0) == 0
+        finally:
+            process.kill()
 
 
 @pytest.mark.slow
