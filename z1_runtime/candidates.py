@@ -26,6 +26,10 @@ class Way:
     """(4, 4)."""
     jaw_open: float
     """[rad]"""
+    T_base_touch: np.ndarray
+    """(4, 4) pivot pose to which the hand turns while the jaw closes."""
+    jaw_touch: float
+    """Mover angle there [rad]."""
 
 
 class Candidates:
@@ -89,6 +93,8 @@ class Candidates:
                 T_base_pivot=batch.T_base_pivots[n, flip],
                 T_base_grasp=T_base_grasp,
                 jaw_open=float(batch.jaw_open[n]),
+                T_base_touch=batch.T_base_touches[n, flip],
+                jaw_touch=float(batch.jaw_touch[n]),
             )
             for flip in free
         ]

@@ -14,7 +14,8 @@ from z1_runtime.candidates import Way
 from z1_runtime.collision import CollisionChecker
 from z1_runtime.kinematics import IkFailure, Kinematics
 from z1_runtime.planner_config import PlannerConfig
-from z1_runtime.trajectory import MotionLimits, PathFailure, gripper_move, joint_path, straight_move
+from z1_runtime.se3 import inverse
+from z1_runtime.trajectory import MotionLimits, PathFailure, concatenate, gripper_move, joint_path, straight_move
 from z1_runtime.types import JointTrajectory
 
 StageTimer = Callable[[str], AbstractContextManager[None]]
@@ -109,7 +110,9 @@ class MotionPlanner:
                 result = self._kinematics.best(way.T_base_pivot)
             except IkFailure as failure:
                 raise Refused("ik", f"{failure} (least squares)") from failure
-            return replace(way, T_base_pivot=self._kinematics.pivot(result.q))
+            T_base_pivot = self._kinematics.pivot(result.q)
+            turn = inverse(way.T_base_pivot) @ way.T_base_touch
+            return replace(way, T_base_pivot=T_base_pivot, T_base_touch=T_base_pivot @ turn)
 
     def _branches(self, T_pre: np.ndarray, way: Way) -> tuple[list[np.ndarray], Refused | None]:
         """Return pre-grasp joints (6,), nearest to home first, or which of the three poses is out of reach."""
@@ -126,12 +129,15 @@ class MotionPlanner:
     def _motion(self, way: Way, T_pre: np.ndarray, q_arm: np.ndarray) -> Motion:
         checker, limits = self._checker, self._limits
         q_pre = np.append(q_arm, way.jaw_open)
-        T_lifted = _shifted(way.T_base_pivot, np.array([0.0, 0.0, self._config.lift_m]))
+        T_lifted = _shifted(way.T_base_touch, np.array([0.0, 0.0, self._config.lift_m]))
         try:
             approach = straight_move(self._kinematics, T_pre, way.T_base_pivot, q_pre, way.jaw_open, limits)
+            touch = straight_move(
+                self._kinematics, way.T_base_pivot, way.T_base_touch, approach.q[-1], way.jaw_touch, limits
+            )
             # The servo bounds the torque, so "closed" is where the jaws are sent, not where they end.
-            close = gripper_move(approach.q[-1], z1.GRIPPER_CLOSED, limits)
-            lift = straight_move(self._kinematics, way.T_base_pivot, T_lifted, close.q[-1], z1.GRIPPER_CLOSED, limits)
+            close = concatenate([touch, gripper_move(touch.q[-1], z1.GRIPPER_CLOSED, limits)])
+            lift = straight_move(self._kinematics, way.T_base_touch, T_lifted, close.q[-1], z1.GRIPPER_CLOSED, limits)
         except PathFailure as failure:
             raise Refused("path", str(failure)) from failure
         _refuse(

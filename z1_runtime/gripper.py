@@ -5,6 +5,9 @@ closed), then recedes by about 23° towards the palm. The edge between the two, 
 mover's axis on both jaws. With the beak opened by φ the flats stand φ apart, so they would squeeze an object out like a
 wedge; the knees face each other squarely whatever φ is. A grasp therefore puts the knees on the contact axis, the
 object midway, and splits φ between the two jaws. Objects wider than 65 mm touch the palm first and sit further out.
+
+Only one jaw moves, so a hand that stands still would shove the object over to the fixed one, and topple what leans.
+While the jaw closes the hand therefore turns about the jaw's axis the other way, and both jaws arrive together.
 """
 
 from __future__ import annotations
@@ -13,6 +16,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 
 from hal import z1
 
@@ -54,10 +58,10 @@ class BeakConfig:
     """How far before the asked contacts an object that reaches deep into the hand may be held instead [m]."""
     palm_clearance_m: float = 0.005
     """Free space between the palm and the object [m]."""
-    stator_clearance_m: float = 0.005
-    """Gap between the fixed jaw and the object while approaching [m]."""
-    opening_clearance_m: float = 0.014
-    """Gap between the moving jaw and the object while approaching; opening wider makes tilted objects collide [m]."""
+    clearance_m: float = 0.0095
+    """Gap between each jaw and the object while approaching; opening wider makes tilted objects collide [m]."""
+    squeeze_m: float = 0.004
+    """How much narrower than the object the gap is where the hand stops turning; the jaw closes on from there [m]."""
     friction: float = 0.4
     """Least friction coefficient that must keep the object from being squeezed out; rubber on plastic has 0.5 to 1."""
 
@@ -72,6 +76,10 @@ class BeakGrasp:
     """Mover angle at which both jaws touch an object of that width [rad]."""
     jaw_open: float
     """Mover angle while approaching [rad]."""
+    T_base_touch: np.ndarray
+    """(4, 4) pivot pose once both jaws press: turned about the jaw's axis, the object where it was."""
+    jaw_touch: float
+    """Mover angle there [rad]."""
     width_m: float
     """Object width [m]."""
     flipped: bool
@@ -87,6 +95,10 @@ class BeakBatch:
     jaw_contact: np.ndarray
     """(N,) [rad]."""
     jaw_open: np.ndarray
+    """(N,) [rad]."""
+    T_base_touches: np.ndarray
+    """(N, 2, 4, 4) pivot poses once both jaws press."""
+    jaw_touch: np.ndarray
     """(N,) [rad]."""
     fits: np.ndarray
     """(N,) False where the width is refused; the other rows of such a grasp mean nothing."""
@@ -133,6 +145,8 @@ class BeakGripper:
                 T_base_pivot=batch.T_base_pivots[0, flip],
                 jaw_contact=float(batch.jaw_contact[0]),
                 jaw_open=float(batch.jaw_open[0]),
+                T_base_touch=batch.T_base_touches[0, flip],
+                jaw_touch=float(batch.jaw_touch[0]),
                 width_m=float(width_m),
                 flipped=bool(flip),
             )
@@ -162,10 +176,13 @@ class BeakGripper:
         T_grasp_pivot = _grasp_to_pivot(lay.centre, lay.tilt)
         T_grasp_pivot[:, 2, 3] -= self.config.contact_depth_m + lay.setback_m
         flip = np.diag([-1.0, -1.0, 1.0, 1.0])
+        T_base_pivots = np.stack([T_base_grasps @ T_grasp_pivot, T_base_grasps @ flip @ T_grasp_pivot], axis=1)
         return BeakBatch(
-            T_base_pivots=np.stack([T_base_grasps @ T_grasp_pivot, T_base_grasps @ flip @ T_grasp_pivot], axis=1),
+            T_base_pivots=T_base_pivots,
             jaw_contact=-lay.contact,
             jaw_open=np.maximum(-lay.opened, z1.GRIPPER_OPEN),
+            T_base_touches=T_base_pivots @ mover_pose(-lay.turn)[:, None],
+            jaw_touch=-lay.pressed,
             fits=usable & self._fits(lay),
         )
 
@@ -191,10 +208,14 @@ class _Lay(NamedTuple):
     """(N,) opening at which both jaws touch [rad]."""
     opened: np.ndarray
     """(N,) opening that leaves the clearances [rad]."""
+    pressed: np.ndarray
+    """(N,) opening at which the gap is narrower by the squeeze [rad]."""
+    turn: np.ndarray
+    """(N,) how far the hand turns about the mover's axis while the jaw goes from `opened` to `pressed` [rad]."""
     centre: np.ndarray
     """(N, 2) the disc's middle while the jaw is opened [m]."""
     tilt: np.ndarray
-    """(N,) angle of the approach axis from x towards z [rad]."""
+    """(N,) angle of the approach axis from x towards z while the jaw is opened [rad]."""
     squeeze_out: np.ndarray
     """(N,) half the angle between the two contacts' pushes, positive outwards [rad]."""
     setback_m: np.ndarray
@@ -206,8 +227,7 @@ def _lay_around(widths: np.ndarray, fronts: np.ndarray, config: BeakConfig) -> _
     knees = np.sqrt(np.maximum(KNEE_RADIUS_M**2 - r**2, 0.0)) - np.minimum(config.knee_past_m, _MOST_PAST * r)
     palm_m = PALM_RADIUS_M + config.palm_clearance_m
     distance = np.maximum(knees, palm_m + np.minimum(fronts, r))
-    above, below = _bearing(STATOR_FACE, distance, r, 1.0), _bearing(MOVER_FACE, distance, r, -1.0)
-    contact = above - below
+    above, contact = _gap(distance, r)
     centre = _polar(distance, above)
     on_stator = _nearest(STATOR_FACE, centre)
     on_mover = _turned(_nearest(MOVER_FACE, _turned(centre, -contact)), contact)
@@ -215,17 +235,25 @@ def _lay_around(widths: np.ndarray, fronts: np.ndarray, config: BeakConfig) -> _
     across /= np.linalg.norm(across, axis=1, keepdims=True)
     along = np.column_stack([across[:, 1], -across[:, 0]])
     push = np.sum((2.0 * centre - on_stator - on_mover) * along, axis=1)
-    above_open = _bearing(STATOR_FACE, distance, r + config.stator_clearance_m, 1.0)
-    below_open = _bearing(MOVER_FACE, distance, r + config.opening_clearance_m, -1.0)
+    above_open, opened = _gap(distance, r + config.clearance_m)
+    above_pressed, pressed = _gap(distance, np.maximum(r - 0.5 * config.squeeze_m, 0.0))
     return _Lay(
         contact=contact,
-        opened=above_open - below_open,
+        opened=opened,
+        pressed=pressed,
+        turn=above_open - above_pressed,
         centre=_polar(distance, above_open),
-        tilt=np.arctan2(along[:, 1], along[:, 0]),
+        tilt=np.arctan2(along[:, 1], along[:, 0]) + above_open - above,
         squeeze_out=np.arctan2(push, widths),
         # What reaches further towards the palm than it is thick is held where there is room, nearer its front
         setback_m=np.maximum(knees, palm_m + fronts) - distance,
     )
+
+
+def _gap(distance: np.ndarray, r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return where discs at `distance` (N,) that touch both jaws lie above the pivot's x (N,), and the opening (N,)."""
+    above, below = _bearing(STATOR_FACE, distance, r, 1.0), _bearing(MOVER_FACE, distance, r, -1.0)
+    return above, above - below
 
 
 def _grasp_to_pivot(centre: np.ndarray, tilt: np.ndarray) -> np.ndarray:
@@ -245,20 +273,38 @@ def _grasp_to_pivot(centre: np.ndarray, tilt: np.ndarray) -> np.ndarray:
     return T
 
 
-def _bearing(face: np.ndarray, distance: np.ndarray, r: np.ndarray, side: float) -> np.ndarray:
+@njit(cache=True)
+def _bearing(face, distance, r, side):
     """Return the angles (N,) [rad] of discs' middles, at `distance` (N,) from the axis, that just touch `face`.
 
     `side` is +1 when the disc lies above the face, −1 below. The gap grows with the angle: bisection finds it.
     """
     on_face = np.arctan2(face[1, 1], face[1, 0])
-    low, high = np.zeros(len(r)), np.full(len(r), 0.5 * np.pi)
-    for _ in range(22):
-        middle = 0.5 * (low + high)
-        centre = _polar(distance, on_face + side * middle)
-        gap = centre - _nearest(face, centre)
-        overlaps = np.sum(gap * gap, axis=1) < r * r
-        low, high = np.where(overlaps, middle, low), np.where(overlaps, high, middle)
-    return on_face + side * high
+    bearings = np.empty(len(r))
+    for n in range(len(r)):
+        low, high = 0.0, 0.5 * np.pi
+        for _ in range(22):
+            middle = 0.5 * (low + high)
+            angle = on_face + side * middle
+            x, z = distance[n] * np.cos(angle), distance[n] * np.sin(angle)
+            if _squared_gap(face, x, z) < r[n] * r[n]:
+                low = middle
+            else:
+                high = middle
+        bearings[n] = on_face + side * high
+    return bearings
+
+
+@njit(cache=True)
+def _squared_gap(face, x, z):
+    """Return the squared distance of (x, z) from polyline `face` (K, 2)."""
+    least = np.inf
+    for k in range(len(face) - 1):
+        dx, dz = face[k + 1, 0] - face[k, 0], face[k + 1, 1] - face[k, 1]
+        t = ((x - face[k, 0]) * dx + (z - face[k, 1]) * dz) / (dx * dx + dz * dz)
+        t = min(max(t, 0.0), 1.0)
+        least = min(least, (face[k, 0] + t * dx - x) ** 2 + (face[k, 1] + t * dz - z) ** 2)
+    return least
 
 
 def _polar(distance: np.ndarray, angle: np.ndarray) -> np.ndarray:

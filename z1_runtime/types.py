@@ -103,9 +103,10 @@ class GraspPlan:
     approach: JointTrajectory
     """Straight from the pre-grasp to the grasp."""
     close: JointTrajectory
-    """The jaw alone, from open to past contact: the servo's stiffness makes the squeeze."""
+    """The jaw from open to past contact, the hand turning the other way until both jaws press; then the jaw alone:
+    the servo's stiffness makes the squeeze."""
     lift: JointTrajectory
-    """Straight up with the object, jaw command closed."""
+    """Straight up with the object from where the jaws closed, jaw command closed."""
     rejections: tuple[Rejection, ...]
     """Why the other candidates tried were refused: those before this one, and after least squares all others."""
     ik_method: IkMethod = "analytic"

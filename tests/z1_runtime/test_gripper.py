@@ -19,7 +19,7 @@ from z1_runtime.gripper import (
 )
 from z1_runtime.se3 import inverse
 
-TIGHT = BeakConfig(stator_clearance_m=0.0, opening_clearance_m=0.0)
+TIGHT = BeakConfig(clearance_m=0.0)
 
 
 def surface(name: str, offset_x: float) -> np.ndarray:
@@ -46,6 +46,11 @@ def lateral_gaps(T_base_pivot: np.ndarray, jaw: float, stator: np.ndarray, mover
         in_grasp = points @ T[:3, :3].T + T[:3, 3]
         gaps.append(float(np.hypot(in_grasp[:, 1], in_grasp[:, 2]).min() - r))
     return gaps
+
+
+def without_palm(stator: np.ndarray) -> np.ndarray:
+    """Return the fixed jaw's points before the palm, which has a clearance of its own."""
+    return stator[stator[:, 0] > 0.045]
 
 
 def contact_frame(config: BeakConfig) -> np.ndarray:
@@ -80,9 +85,19 @@ def test_both_jaws_touch_a_round_object_of_the_asked_width(width, stator, mover)
 def test_while_approaching_both_jaws_keep_their_clearance(width, stator, mover):
     config = BeakConfig()
     for grasp in BeakGripper(config).fit(contact_frame(config), width):
-        fixed, moving = lateral_gaps(grasp.T_base_pivot, grasp.jaw_open, stator, mover, 0.5 * width)
-        assert fixed == pytest.approx(config.stator_clearance_m, abs=0.0015)
-        assert moving == pytest.approx(config.opening_clearance_m, abs=0.0015)
+        gaps = lateral_gaps(grasp.T_base_pivot, grasp.jaw_open, without_palm(stator), mover, 0.5 * width)
+        assert gaps == pytest.approx([config.clearance_m] * 2, abs=0.0015)
+
+
+@pytest.mark.parametrize("width", [0.02, 0.04, 0.06, 0.08])
+def test_while_closing_the_hand_turns_so_that_both_jaws_arrive_together(width, stator, mover):
+    config = BeakConfig()
+    for grasp in BeakGripper(config).fit(contact_frame(config), width):
+        assert grasp.T_base_touch[:3, 3] == pytest.approx(grasp.T_base_pivot[:3, 3], abs=1e-12)
+        assert grasp.T_base_touch[:3, 1] == pytest.approx(grasp.T_base_pivot[:3, 1], abs=1e-12)
+        gaps = lateral_gaps(grasp.T_base_touch, grasp.jaw_touch, stator, mover, 0.5 * width)
+        assert gaps == pytest.approx([-0.5 * config.squeeze_m] * 2, abs=0.0015)
+        assert grasp.jaw_open < grasp.jaw_contact < grasp.jaw_touch < 0.0
 
 
 def test_the_flips_put_the_fixed_jaw_on_opposite_sides():
@@ -98,7 +113,7 @@ def test_the_fingertips_pass_the_contacts_and_the_squeeze_is_level(width):
     config = BeakConfig()
     gripper = BeakGripper(config)
     grasp, _ = gripper.fit(contact_frame(config), width)
-    tip = grasp.T_base_pivot @ np.array([*STATOR_FACE[0, :1], 0.0, STATOR_FACE[0, 1], 1.0])
+    tip = grasp.T_base_touch @ np.array([*STATOR_FACE[0, :1], 0.0, STATOR_FACE[0, 1], 1.0])
     assert 0.015 < tip[2] < 0.030
     assert abs(gripper.squeeze_out_angle(width)) < np.deg2rad(12)
 

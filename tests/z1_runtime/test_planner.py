@@ -159,7 +159,7 @@ def test_the_first_that_passes_is_taken_and_the_refused_are_reported(planner, ki
     assert plan.approach.q == pytest.approx(alone.approach.q)
 
 
-JUST_OUT_OF_REACH = (0.48, 0.0, 0.089, 0.16, -0.83)
+JUST_OUT_OF_REACH = (0.48, 0.0, 0.089, 0.20, -0.87)
 
 
 def test_a_grasp_just_out_of_reach_is_planned_within_the_paper_s_tolerance(planner, kinematics):
