@@ -10,6 +10,7 @@ import math
 import os
 import sys
 import threading
+from collections import deque
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
@@ -34,6 +35,8 @@ _MAX_CATCH_UP_S = 0.020
 class TwinArm:
     """`hal.arm.Arm` of the simulated Z1; moves between threads as the world does (under its lock).
 
+    A setpoint takes effect as many setpoints later as the scene's `arm_latency_s` says; a stop does at once.
+
     Args:
         world: whose arm it is; by default one of its own with the default scene.
         clock: a `TwinClock` of that world for lock-step (the default), any other for real time.
@@ -44,6 +47,8 @@ class TwinArm:
         self.clock: Clock = clock if clock is not None else TwinClock(self.world)
         self._lockstep = isinstance(self.clock, TwinClock)
         self._connected = False
+        self._late = round(self.world.config.arm_latency_s / z1.CONTROL_PERIOD_S)
+        self._on_the_way: deque[tuple[np.ndarray, np.ndarray]] = deque()
         self._offset_s = 0.0  # clock minus world
 
     def connect(self) -> None:
@@ -78,11 +83,14 @@ class TwinArm:
         self._require_connection()
         q = np.clip(setpoint.q, z1.Q_MIN, z1.Q_MAX)
         dq = np.clip(setpoint.dq, -z1.DQ_MAX, z1.DQ_MAX)
-        self.world.set_command(q, dq)
+        self._on_the_way.append((q, dq))
+        if len(self._on_the_way) > self._late:
+            self.world.set_command(*self._on_the_way.popleft())
         return ArmSetpoint(q=q, dq=dq)
 
     def stop(self) -> None:
         """Hold the position measured now."""
+        self._on_the_way.clear()
         q, _, _ = self.world.read_arm()
         self.world.set_command(np.clip(q, z1.Q_MIN, z1.Q_MAX), np.zeros(z1.N_JOINTS))
 

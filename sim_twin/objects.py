@@ -55,17 +55,24 @@ OBJECTS = _PAPER | EXTENDED
 OBJECT_NAMES = tuple(OBJECTS)
 
 
-def add_object(spec: mujoco.MjSpec, name: str, T_base_object: np.ndarray) -> None:
-    """Add the object as a free body called `object` at `T_base_object` (4, 4)."""
+def add_object(
+    spec: mujoco.MjSpec,
+    thing: GraspObject,
+    T_base_object: np.ndarray,
+    *,
+    name: str = OBJECT_BODY,
+    mass_factor: float = 1.0,
+) -> None:
+    """Add `thing` as a free body called `name` at `T_base_object` (4, 4), `mass_factor` times as heavy as it says."""
     quat = np.empty(4)
     mujoco.mju_mat2Quat(quat, T_base_object[:3, :3].ravel().copy())
-    body = spec.worldbody.add_body(name=OBJECT_BODY, pos=T_base_object[:3, 3], quat=quat)
-    body.add_freejoint(name=OBJECT_BODY)
-    for number, part in enumerate(OBJECTS[name].parts):
+    body = spec.worldbody.add_body(name=name, pos=T_base_object[:3, 3], quat=quat)
+    body.add_freejoint(name=name)
+    for number, part in enumerate(thing.parts):
         geom = body.add_geom(
-            name=f"{OBJECT_BODY}_{number}",
+            name=f"{name}_{number}",
             group=GROUP_SCENE,
-            mass=part.mass_kg,
+            mass=mass_factor * part.mass_kg,
             rgba=part.rgba,
             contype=BIT_SCENE,
             conaffinity=BIT_SCENE | BIT_BASE | BIT_HAND,

@@ -70,6 +70,8 @@ class GraspObject:
 
     height_m: float
     parts: tuple[Part, ...]
+    stands: bool = True
+    """Upright it stands by itself; what does not is held by a break-away fixture in every pose."""
 
     @property
     def mass_kg(self) -> float:

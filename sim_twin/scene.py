@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass
+from functools import lru_cache
 
 import mujoco
 import numpy as np
@@ -11,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from hal import z1
 from sim_twin.board import BoardSpec, add_board
 from sim_twin.objects import OBJECT_BODY, OBJECT_NAMES, OBJECTS, add_object
+from sim_twin.parts import GraspObject
 from sim_twin.z1_mjcf import BIT_BASE, BIT_HAND, BIT_SCENE, CONTACT_SOLIMP, CONTACT_SOLREF, GROUP_SCENE, add_z1
 
 PHYSICS_PERIOD_S = z1.CONTROL_PERIOD_S / 2
@@ -23,20 +26,52 @@ _DISTANCE_M = (0.30, 0.65)
 _LATERAL_M = (-0.25, 0.25)
 _PITCH_DEG = (-60.0, 60.0)
 _MOUNT_ERROR_M, _MOUNT_ERROR_DEG = (0.0, 0.02), (0.0, 10.0)
+_FACTOR = (0.1, 10.0)
+_ARM_LATENCY_S = (0.0, 0.1)
 _ASIDE_M = (0.90, -0.50)  # where the object stands, out of reach, when there is a board
 _TABLE_FRICTION = (0.4, 0.005, 0.0001)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Neighbour:
+    """Something that stands upright beside the object.
+
+    Raises:
+        ValueError: there is no such object.
+    """
+
+    object: str
+    """One of `sim_twin.objects.OBJECT_NAMES`."""
+    x_m: float
+    """Of its origin along base x."""
+    y_m: float
+    """The same along base y."""
+    yaw_deg: float = 0.0
+    """Turn about base z."""
+
+    def __post_init__(self) -> None:
+        _check_object(self.object)
+
+    def T_base_object(self) -> np.ndarray:
+        """Return its pose (4, 4) at the start."""
+        pose = np.eye(4)
+        pose[:3, :3] = Rotation.from_euler("z", self.yaw_deg, degrees=True).as_matrix()
+        pose[:3, 3] = [self.x_m, self.y_m, OBJECTS[self.object].height_m / 2]
+        return pose
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class SceneConfig:
-    """One object on the table in front of the arm, or a calibration board.
+    """One object, maybe among neighbours, on the table in front of the arm; or a calibration board.
 
     Raises:
         ValueError: a field is out of its range; the message says what is allowed.
     """
 
     object: str = "bottle"
-    """One of `sim_twin.objects.OBJECT_NAMES`."""
+    """One of `sim_twin.objects.OBJECT_NAMES`, or the name of `shape`."""
+    shape: GraspObject | None = None
+    """The object itself, where it is none of the named ones."""
     distance_m: float = 0.48
     """Of the object's origin (mid-height on its axis) from the base, along base x."""
     lateral_m: float = 0.0
@@ -55,19 +90,40 @@ class SceneConfig:
     """How far it is really turned [°]."""
     mount_seed: int = 0
     """Of the direction of both."""
+    neighbours: tuple[Neighbour, ...] = ()
+    """What stands on the table besides."""
+    friction_factor: float = 1.0
+    """Every surface's friction over what it should be."""
+    mass_factor: float = 1.0
+    """The object's mass over what it should be."""
+    arm_latency_s: float = 0.0
+    """How late the arm does what it is told, rounded to control periods [s]."""
 
     def __post_init__(self) -> None:
-        if self.object not in OBJECT_NAMES:
-            raise ValueError(f"there is no object {self.object!r}; choose one of: {', '.join(OBJECT_NAMES)}.")
+        if self.shape is None:
+            _check_object(self.object)
         _check_range("distance_m", self.distance_m, _DISTANCE_M, "m in front of the base")
         _check_range("lateral_m", self.lateral_m, _LATERAL_M, "m to the side")
         _check_range("pitch_deg", self.pitch_deg, _PITCH_DEG, "degrees of lean")
         _check_range("mount_error_m", self.mount_error_m, _MOUNT_ERROR_M, "m", "allowed is")
         _check_range("mount_error_deg", self.mount_error_deg, _MOUNT_ERROR_DEG, "degrees", "allowed is")
+        _check_range("friction_factor", self.friction_factor, _FACTOR, "times the usual", "allowed is")
+        _check_range("mass_factor", self.mass_factor, _FACTOR, "times the usual", "allowed is")
+        _check_range("arm_latency_s", self.arm_latency_s, _ARM_LATENCY_S, "s", "allowed is")
         for name in ("seed", "mount_seed"):
             seed = getattr(self, name)
             if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**32:
                 raise ValueError(f"{name} is {seed!r}; allowed is a whole number from 0 to {2**32 - 1}.")
+
+    @property
+    def thing(self) -> GraspObject:
+        """What the object is."""
+        return OBJECTS[self.object] if self.shape is None else self.shape
+
+    @property
+    def is_held(self) -> bool:
+        """Whether a break-away fixture holds the object: it leans, or cannot stand."""
+        return self.pitch_deg != 0 or not self.thing.stands
 
     def T_base_object(self) -> np.ndarray:
         """Return the object's pose (4, 4) at the start, its lowest point on the table."""
@@ -75,7 +131,7 @@ class SceneConfig:
         c, s = np.cos(pitch), np.sin(pitch)
         pose = np.eye(4)
         pose[:3, :3] = [[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]]
-        lowest = (OBJECTS[self.object].corners() @ pose[2, :3]).min()
+        lowest = (self.thing.corners() @ pose[2, :3]).min()
         where = _ASIDE_M if self.board is not None else (self.distance_m, self.lateral_m)
         pose[:3, 3] = [*where, -lowest]
         return pose
@@ -96,6 +152,11 @@ class SceneConfig:
         return f"twin-{1e3 * self.mount_error_m:g}mm-{self.mount_error_deg:g}deg-{self.mount_seed}"
 
 
+def _check_object(name: str) -> None:
+    if name not in OBJECT_NAMES:
+        raise ValueError(f"there is no object {name!r}; choose one of: {', '.join(OBJECT_NAMES)}.")
+
+
 def _check_range(
     name: str, value: float, allowed: tuple[float, float], what: str, why: str = "the arm reaches"
 ) -> None:
@@ -103,8 +164,18 @@ def _check_range(
         raise ValueError(f"{name} is {value!r}; {why} {allowed[0]:g} to {allowed[1]:g} {what}.")
 
 
+def neighbour_body(number: int) -> str:
+    """Return the name of the body of the neighbour of that number, from 0."""
+    return f"neighbour_{number}"
+
+
 def build_model(config: SceneConfig) -> mujoco.MjModel:
-    """Compile arm, table, object and, if there is one, the board."""
+    """Return the model of arm, table, object and, if there are any, neighbours and board; it is the caller's own."""
+    return copy.copy(_compile(config))
+
+
+@lru_cache(maxsize=2)  # an episode builds its scene several times; compiling the arm's meshes takes 0.2 s
+def _compile(config: SceneConfig) -> mujoco.MjModel:
     spec = mujoco.MjSpec()
     spec.compiler.degree = False
     _set_options(spec)
@@ -112,12 +183,16 @@ def build_model(config: SceneConfig) -> mujoco.MjModel:
     add_z1(spec, config.T_flange_camera())
     if config.board is not None:
         add_board(spec, config.board)
-    add_object(spec, config.object, config.T_base_object())
-    if config.pitch_deg != 0:
+    add_object(spec, config.thing, config.T_base_object(), mass_factor=config.mass_factor)
+    for number, neighbour in enumerate(config.neighbours):
+        add_object(spec, OBJECTS[neighbour.object], neighbour.T_base_object(), name=neighbour_body(number))
+    if config.is_held:
         weld = spec.add_equality(name=FIXTURE, type=mujoco.mjtEq.mjEQ_WELD, objtype=mujoco.mjtObj.mjOBJ_BODY)
         weld.name1, weld.name2 = OBJECT_BODY, "world"
         weld.data = [0.0] * 10 + [1.0, 0.0]  # anchor and relative pose left to the compiler; torque scale 1 m
-    return spec.compile()
+    model = spec.compile()
+    model.geom_friction *= config.friction_factor
+    return model
 
 
 def _set_options(spec: mujoco.MjSpec) -> None:

@@ -110,6 +110,11 @@ class Perception:
         self._detector = detector
         self._T_flange_camera = T_flange_camera
 
+    @property
+    def detector(self) -> Detector:
+        """Who says where the object is."""
+        return self._detector
+
     def observe(self, frame: RgbdFrame, T_base_camera: np.ndarray, jaw: float, label: str | None = None) -> Observation:
         """Return what is seen; arguments and errors as in `detect` and `segment`."""
         return self.segment(frame, T_base_camera, jaw, self.detect(frame, T_base_camera, jaw, label))

@@ -2,97 +2,153 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
+from hal.errors import HalError
 from hal.messages import RgbdFrame
-from models.mvbb import RankedGrasps
 from models.obb import DegenerateCloudError
-from models.types import GraspSet
 from sim_twin.bench.methods import Method, file_name
 from sim_twin.bench.occlusion import occlude
-from sim_twin.bench.recordings import Recordings
+from sim_twin.bench.recordings import Recordings, record
+from sim_twin.bench.rows import Attempt, Row, make_row
 from sim_twin.bench.scenarios import Scenario
-from sim_twin.bench.trial import Mode, Outcome, act, look
+from sim_twin.bench.seen import Seen
+from sim_twin.bench.trial import RETRIED, Mode, Outcome, Robot, look
 from z1_runtime.cloud import PerceptionError
 from z1_runtime.decision import Decider, StageTimes
+from z1_runtime.executor import MotionError
 from z1_runtime.planner import NoPlanError
-from z1_runtime.trajectory import MotionLimits
-from z1_runtime.types import GraspPlan, Observation, Rejection
+from z1_runtime.types import Rejection
 
-Row = dict[str, Any]
-"""One episode: column name to value, see `COLUMNS` in `sim_twin.bench.rows`."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Seen:
-    """What all methods share of one scenario."""
-
-    frame: RgbdFrame
-    q: np.ndarray
-    """(7,) joints it was taken at [rad]."""
-    observation: Observation
-    candidates: GraspSet
-    times: StageTimes
-    """detect, cloud, generate."""
+MakeDecider = Callable[[Scenario, int], Decider]
+"""Returns the runtime's decider for a scenario, with the generator's seed set to the second argument."""
 
 
 def run_scenario(
     scenario: Scenario,
     methods: Sequence[Method],
-    make_decider: Callable[[int], Decider],
+    make_decider: MakeDecider,
+    *,
+    top_k: int = 1,
     recordings: Recordings | None = None,
 ) -> list[Row]:
-    """Return one row for each of `methods`, all on the same frame and the same candidates.
+    """Return one row for each of `methods`, all on the same first frame and the same candidates.
 
     Args:
         scenario: what stands where.
         methods: how candidates are ordered.
-        make_decider: returns the runtime's decider with the generator's seed set to its argument.
+        make_decider: called once for each attempt.
+        top_k: candidates that may be executed; after a failure the scene is looked at again, as it then is.
         recordings: which episodes are written for Rerun too.
     """
-    scene, decider = scenario.scene(), make_decider(scenario.draw_seed)
-    frame, q = look(scene)
-    frame = occlude(frame, scenario.occlusion, scenario.draw_seed)
+    decider = make_decider(scenario, scenario.draw_seed)
+    seen = _first_look(scenario, decider)
+    if isinstance(seen, Attempt):
+        return [make_row(scenario, method.name, [seen], top_k=top_k) for method in methods]
+    return [_run_method(scenario, method, make_decider, seen, top_k=top_k, recordings=recordings) for method in methods]
+
+
+def record_scenario(scenario: Scenario, method: Method, make_decider: MakeDecider, folder: Path) -> Path | None:
+    """Write what `method` sees, ranks and chooses at its first look as <scenario>-<method>.rrd in `folder`.
+
+    Returns:
+        The file, or None where nothing is seen.
+    """
+    decider = make_decider(scenario, scenario.draw_seed)
+    seen = _first_look(scenario, decider)
+    if isinstance(seen, Attempt):
+        return None
+    return record(folder / recording_name(scenario, method), _decide(method, decider, seen))
+
+
+def recording_name(scenario: Scenario, method: Method) -> str:
+    """Return the name of an episode's recording."""
+    return f"{scenario.key}-{file_name(method.name)}.rrd"
+
+
+def _first_look(scenario: Scenario, decider: Decider) -> Seen | Attempt:
+    """Return what is seen from home, or the attempt that ended with the look."""
+    frame, q = look(scenario.scene())
+    return _see(scenario, decider, frame, q)
+
+
+def _see(scenario: Scenario, decider: Decider, frame: RgbdFrame, q: np.ndarray) -> Seen | Attempt:
     times = StageTimes()
     try:
-        observation = decider.observe(frame, q, times)
+        return Seen.by(decider, occlude(frame, scenario.occlusion, scenario.draw_seed), q, times)
     except PerceptionError as error:
-        return [_row(scenario, method, Outcome(mode=Mode.NO_DETECTION, detail=str(error)), times) for method in methods]
-    try:
-        with times.stage("generate"):
-            candidates = decider.propose(observation)
+        return Attempt(outcome=Outcome(mode=Mode.NO_DETECTION, detail=str(error)), times=times)
     except ValueError as error:
-        return [_row(scenario, method, Outcome(mode=Mode.NO_CANDIDATE, detail=str(error)), times) for method in methods]
-    seen = Seen(frame=frame, q=q, observation=observation, candidates=candidates, times=times)
-    return [_run_method(scenario, method, decider, seen, recordings) for method in methods]
+        if "generate" not in times.ms:
+            raise
+        return Attempt(outcome=Outcome(mode=Mode.NO_CANDIDATE, detail=str(error)), times=times)
 
 
-def _run_method(scenario: Scenario, method: Method, decider: Decider, seen: Seen, recordings: Recordings | None) -> Row:
+def _run_method(
+    scenario: Scenario,
+    method: Method,
+    make_decider: MakeDecider,
+    seen: Seen,
+    *,
+    top_k: int,
+    recordings: Recordings | None,
+) -> Row:
+    decider = make_decider(scenario, scenario.draw_seed)
+    first = _decide(method, decider, seen)
+    attempts, given_up, qpos = [first], "", None
+    if first.plan is not None:
+        with Robot(scenario.scene(), decider.kinematics, decider.config.speed) as robot:
+            attempts, given_up = _act(scenario, method, make_decider, robot, first, top_k=top_k)
+            qpos = robot.world.data.qpos.copy()
+    row = make_row(scenario, method.name, attempts, top_k=top_k, given_up=given_up, qpos=qpos)
+    if recordings is not None and recordings.wants(success=row["success"]):
+        record(recordings.folder / recording_name(scenario, method), first)
+    return row
+
+
+def _act(
+    scenario: Scenario, method: Method, make_decider: MakeDecider, robot: Robot, first: Attempt, *, top_k: int
+) -> tuple[list[Attempt], str]:
+    """Execute `first` and, after a failure, what is decided on another look; return all attempts and why it was left
+    at them."""
+    attempt = first
+    attempts: list[Attempt] = []
+    while True:
+        assert attempt.plan is not None
+        outcome = robot.act(attempt.plan)
+        attempts.append(replace(attempt, outcome=outcome))
+        if outcome.mode not in RETRIED or len(attempts) == top_k:
+            return attempts, ""
+        decider = make_decider(scenario, scenario.draw_seed + len(attempts))
+        try:
+            robot.withdraw(attempt.plan, outcome, decider.config.jaw_home)
+            if len(attempts) == 1:
+                robot.look()  # this robot's first frame would have the noise of the episode's first look
+            found = _see(scenario, decider, *robot.look())
+        except (MotionError, HalError) as error:
+            return attempts, f"{Mode.STOPPED.value}: {error}"
+        attempt = found if isinstance(found, Attempt) else _decide(method, decider, found)
+        if attempt.plan is None:
+            return attempts, f"{attempt.ended.mode.value}: {attempt.ended.detail}"
+
+
+def _decide(method: Method, decider: Decider, seen: Seen) -> Attempt:
+    """Return the attempt that `method` would make; without a plan where there is none."""
     times = StageTimes()
-    times.ms.update(seen.times.ms)
-    ranked, n_free, plan, final = None, -1, None, {}
+    times.ms |= seen.times.ms
+    ranked = left = None
     try:
-        with times.stage("rank"):
-            ranked, n_free = method.order(seen.candidates, seen.observation, decider, seen.q)
+        ranked, left = method.order(seen, decider, times)
         plan = decider.planner.plan(ranked.grasps, seen.observation, seen.q, times.stage)
     except (DegenerateCloudError, NoPlanError) as error:
         rejections = error.rejections if isinstance(error, NoPlanError) else ()
         outcome = Outcome(mode=_why_no_plan(rejections), detail=str(error))
-    else:
-        rejections = plan.rejections
-        limits = MotionLimits.at_speed(decider.config.speed)
-        outcome, qpos = act(scenario.scene(), plan, decider.kinematics, limits)
-        final["final_qpos"] = qpos.tolist()
-    row = _row(scenario, method, outcome, times, seen, ranked=ranked, n_free=n_free, plan=plan, rejections=rejections)
-    if recordings is not None:
-        name, success = f"{scenario.key}-{file_name(method.name)}", row["success"]
-        recordings.keep(name, success=success, observation=seen.observation, ranked=ranked, plan=plan)
-    return row | final
+        return Attempt(times=times, outcome=outcome, seen=seen, ranked=ranked, left=left, rejections=rejections)
+    return Attempt(times=times, seen=seen, ranked=ranked, left=left, plan=plan, rejections=plan.rejections)
 
 
 def _why_no_plan(rejections: Sequence[Rejection]) -> Mode:
@@ -101,59 +157,3 @@ def _why_no_plan(rejections: Sequence[Rejection]) -> Mode:
     if "path" in reasons or "self" in reasons:
         return Mode.NO_PATH
     return Mode.NO_IK if "ik" in reasons else Mode.NO_CANDIDATE
-
-
-def _row(
-    scenario: Scenario,
-    method: Method,
-    outcome: Outcome,
-    times: StageTimes,
-    seen: Seen | None = None,
-    *,
-    ranked: RankedGrasps | None = None,
-    n_free: int = -1,
-    plan: GraspPlan | None = None,
-    rejections: Sequence[Rejection] = (),
-) -> Row:
-    success = outcome.mode is Mode.SUCCESS
-    row: Row = {**scenario.features(), "method": method.name}
-    row |= {"success": success, "success_top1": success and plan is not None and plan.rank == 0}
-    row |= asdict(outcome) | {"mode": outcome.mode.value}
-    row |= {f"{stage}_ms": ms for stage, ms in times.ms.items()}
-    reasons = Counter(rejection.reason for rejection in rejections)
-    row |= {
-        f"rejected_{reason}": reasons[reason] for reason in ("width", "table", "scene", "object", "self", "ik", "path")
-    }
-    if seen is not None:
-        row |= {"n_object_points": len(seen.observation.object_points), "n_candidates": len(seen.candidates)}
-        row |= {"detection_confidence": seen.observation.detection.confidence, "iou": _iou(seen)}
-    if ranked is not None:
-        row |= {"n_free": n_free, "n_ranked": len(ranked)}
-        if ranked.box is not None:
-            T_base_camera = seen.observation.T_base_camera if seen else np.eye(4)
-            normals = ranked.box.face_normals[ranked.faces] @ T_base_camera[:3, :3].T
-            row |= {"box_extents_m": ranked.box.extents_m.tolist(), "faces": ranked.faces.tolist()}
-            row |= {"face_normals": normals.ravel().tolist()}
-    if plan is not None and ranked is not None:
-        index = int(ranked.indices[plan.rank])
-        row |= {
-            "rank": plan.rank,
-            "alignment": float(ranked.alignments[plan.rank]),
-            "rank_score": float(ranked.scores[plan.rank]),
-            "generator_score": float(seen.candidates.scores[index]) if seen else np.nan,
-            "candidate": index,
-            "width_m": plan.width_m,
-            "jaw_open": plan.jaw_open,
-            "ik_method": plan.ik_method,
-            "T_base_grasp": plan.T_base_grasp.ravel().tolist(),
-            "T_base_pivot": plan.T_base_pivot.ravel().tolist(),
-        }
-    return row
-
-
-def _iou(seen: Seen) -> float:
-    """Return how well the detector's mask meets the truth."""
-    mask, truth = seen.observation.detection.mask, seen.frame.truth_mask
-    if mask is None or truth is None:
-        return float("nan")
-    return float((mask & truth).sum() / max((mask | truth).sum(), 1))

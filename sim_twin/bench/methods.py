@@ -9,10 +9,8 @@ import numpy as np
 
 from models.mvbb import FitMethod, RankedGrasps, fit_obb, rank_by_score, rank_grasps
 from models.types import GraspSet
-from z1_runtime.candidates import Candidates
-from z1_runtime.collision import CollisionChecker
-from z1_runtime.decision import Decider
-from z1_runtime.types import Observation
+from sim_twin.bench.seen import Seen
+from z1_runtime.decision import Decider, StageTimes
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -34,28 +32,34 @@ class Method:
     hard_filter: bool = True
     """Whether grasps with a_j ≤ 0 are dropped; without it they only rank low."""
 
-    def order(
-        self, candidates: GraspSet, observation: Observation, decider: Decider, q: np.ndarray
-    ) -> tuple[RankedGrasps, int]:
-        """Return the candidates in the order to try them, and how many were free of collision.
+    def order(self, seen: Seen, decider: Decider, times: StageTimes) -> tuple[RankedGrasps, np.ndarray]:
+        """Return the candidates in the order to try them, and which (M,) were left before the ranking.
+
+        The ranking's own indices count in those that were left.
 
         Args:
-            candidates: of the generator, camera frame.
-            observation: what they were made from.
+            seen: the look, with its candidates.
             decider: whose kinematics, gripper and box settings are used.
-            q: (7,) joints when the frame was taken [rad].
+            times: gets the stages `filter` (of collisions) and `rank` (fit, filter by the box, score).
 
         Raises:
             DegenerateCloudError: the object's cloud spans no box.
             NoPlanError: `full` keeps none.
         """
+        left = np.arange(len(seen.candidates))
+        if self.rank_by != "full" and self.collision_filter:
+            left = np.flatnonzero(seen.free(decider, times))
+        with times.stage("rank"):
+            return self._rank(seen.candidates[left], seen, decider), left
+
+    def _rank(self, candidates: GraspSet, seen: Seen, decider: Decider) -> RankedGrasps:
+        observation = seen.observation
         if self.rank_by == "full":
-            return decider.rank(candidates, observation), len(candidates)
-        free = candidates[_free(candidates, observation, decider, q)] if self.collision_filter else candidates
+            return decider.rank(candidates, observation)
         if self.rank_by == "score":
-            return rank_by_score(free), len(free)
+            return rank_by_score(candidates)
         box = fit_obb(observation.object_points, self.box, up=observation.T_base_camera[2, :3])
-        return rank_grasps(free, box, k=self.k, alpha=self.alpha, hard_filter=self.hard_filter), len(free)
+        return rank_grasps(candidates, box, k=self.k, alpha=self.alpha, hard_filter=self.hard_filter)
 
 
 METHODS = {
@@ -103,17 +107,3 @@ def _converted(text: str, key: str, value: str) -> object:
     if key == "box" and value not in ("pca", "min_volume", "upright"):
         raise ValueError(f"method {text!r}: box is {value!r}; allowed: pca, min_volume, upright.")
     return converted
-
-
-def _free(candidates: GraspSet, observation: Observation, decider: Decider, q: np.ndarray) -> np.ndarray:
-    """Return (N,) which candidates the beak can be laid around without hitting a point that was seen."""
-    planner = decider.planner
-    checker = CollisionChecker(decider.kinematics, observation, q, planner.config.collision)
-    laid = Candidates(
-        candidates,
-        observation.T_base_camera,
-        planner.gripper,
-        checker,
-        fallback_width_m=planner.config.fallback_width_m,
-    )
-    return laid.free()

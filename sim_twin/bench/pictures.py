@@ -11,8 +11,8 @@ from typing import Literal
 import numpy as np
 from PIL import Image
 
-from sim_twin.bench.episode import Row
 from sim_twin.bench.methods import file_name
+from sim_twin.bench.rows import Row
 from sim_twin.bench.scenarios import Scenario
 from sim_twin.view import draw_picture
 

@@ -6,39 +6,39 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from models.mvbb import RankedGrasps
+from sim_twin.bench.rows import Attempt
 from z1_runtime.inspect import Inspector
-from z1_runtime.types import GraspPlan, Observation
 
 _CLOSE_S = 60.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Recordings:
-    """Which episodes are recorded, and where to."""
+    """Which episodes are recorded as they are run, and where to."""
 
     folder: Path
     choice: Literal["failures", "all"]
 
-    def keep(
-        self, name: str, *, success: bool, observation: Observation, ranked: RankedGrasps | None, plan: GraspPlan | None
-    ) -> None:
-        """Write <name>.rrd with the clouds, the candidates, the box and the plan, as far as it came to them.
+    def wants(self, *, success: bool) -> bool:
+        """Return whether an episode that ended so is recorded."""
+        return self.choice == "all" or not success
 
-        Args:
-            name: of the episode.
-            success: how it ended; a success is written only if all are.
-            observation: what was seen.
-            ranked: the candidates in the order they were tried.
-            plan: what was executed.
-        """
-        if success and self.choice == "failures":
-            return
-        inspector = Inspector(self.folder / f"{name}.rrd")
-        inspector.log_observation(observation)
-        if ranked is not None:
-            inspector.log_box(ranked.box, ranked.faces, observation.T_base_camera)
-            inspector.log_candidates(ranked.grasps, observation.T_base_camera)
-        if plan is not None:
-            inspector.log_plan(plan)
-        inspector.close(_CLOSE_S)
+
+def record(path: Path, attempt: Attempt) -> Path:
+    """Write the clouds, the candidates, the box and the plan of `attempt`, as far as it came to them, to `path`.
+
+    Raises:
+        ValueError: nothing was seen.
+    """
+    if attempt.seen is None:
+        raise ValueError(f"an attempt in which nothing was seen cannot be recorded as {path}.")
+    observation, ranked = attempt.seen.observation, attempt.ranked
+    inspector = Inspector(path)
+    inspector.log_observation(observation)
+    if ranked is not None:
+        inspector.log_box(ranked.box, ranked.faces, observation.T_base_camera)
+        inspector.log_candidates(ranked.grasps, observation.T_base_camera)
+    if attempt.plan is not None:
+        inspector.log_plan(attempt.plan)
+    inspector.close(_CLOSE_S)
+    return path

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from sim_twin.bench import svg
-from sim_twin.bench.episode import Row
 from sim_twin.bench.methods import METHODS
+from sim_twin.bench.rows import Row
 from sim_twin.bench.scenarios import DISTANCES_M, LATERALS_M
 from sim_twin.bench.summary import STAGES
 

@@ -1,20 +1,30 @@
-"""Runs scenarios side by side and keeps every row as it comes."""
+"""Runs scenarios side by side and hands over every row as it comes."""
 
 from __future__ import annotations
 
 import multiprocessing
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, ProcessPoolExecutor, wait
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import islice
+from typing import TYPE_CHECKING
 
-from sim_twin.bench.episode import Row, run_scenario
+from sim_twin.bench.episode import run_scenario
 from sim_twin.bench.methods import Method
 from sim_twin.bench.recordings import Recordings
+from sim_twin.bench.rows import Row
 from sim_twin.bench.scenarios import Scenario
+from sim_twin.bench.targeting import aim
 from z1_runtime.config import RuntimeConfig
+
+if TYPE_CHECKING:
+    from z1_runtime.decision import Decider
+
+ONE_THREAD = {name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")}
+"""Environment of a process that shall keep to one core: the workers themselves fill the machine."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -24,6 +34,7 @@ class Task:
     scenario: Scenario
     methods: tuple[Method, ...]
     config: RuntimeConfig
+    top_k: int = 1
     recordings: Recordings | None = None
 
 
@@ -32,6 +43,8 @@ def make_tasks(
     methods: Sequence[Method],
     config: RuntimeConfig,
     done: set[tuple[str, str]],
+    *,
+    top_k: int = 1,
     recordings: Recordings | None = None,
 ) -> list[Task]:
     """Return what is left to do: methods of a scenario that are done are left out."""
@@ -39,13 +52,17 @@ def make_tasks(
     for scenario in scenarios:
         left = tuple(method for method in methods if (scenario.key, method.name) not in done)
         if left:
-            tasks.append(Task(scenario=scenario, methods=left, config=config, recordings=recordings))
+            tasks.append(Task(scenario=scenario, methods=left, config=config, top_k=top_k, recordings=recordings))
     return tasks
 
 
 def run_task(task: Task) -> list[Row]:
     """Return the rows of one task; what it needs is built once in each process."""
-    return run_scenario(task.scenario, task.methods, lambda seed: _decider(task.config, seed), task.recordings)
+
+    def decider(scenario: Scenario, seed: int) -> Decider:
+        return make_decider(task.config, scenario, seed)
+
+    return run_scenario(task.scenario, task.methods, decider, top_k=task.top_k, recordings=task.recordings)
 
 
 def run_tasks(tasks: Sequence[Task], jobs: int) -> Iterator[list[Row]]:
@@ -53,12 +70,10 @@ def run_tasks(tasks: Sequence[Task], jobs: int) -> Iterator[list[Row]]:
 
     A row does not depend on `jobs`, nor on which process made it: each scenario has its own seeds.
     """
-    if jobs == 1:
-        yield from map(run_task, tasks)
-        return
     # A fresh interpreter for each: forked ones would share OpenGL and torch with this one.
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(jobs, mp_context=context, initializer=_one_thread) as pool:
+    jobs = min(jobs, max(len(tasks), 1))
+    with environment(ONE_THREAD), ProcessPoolExecutor(jobs, mp_context=context, initializer=one_thread) as pool:
         yield from _in_order_of_ending(pool, tasks, 2 * jobs)
 
 
@@ -72,31 +87,50 @@ def _in_order_of_ending(pool: Executor, tasks: Sequence[Task], ahead: int) -> It
             yield future.result()
 
 
-def _one_thread() -> None:
-    """Keep the maths libraries of a worker to one thread: the workers themselves fill the cores."""
-    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-        os.environ[name] = "1"
+@contextmanager
+def environment(variables: Mapping[str, str]) -> Iterator[None]:
+    """Set environment variables while the body runs: a child reads them before it can be told anything."""
+    before = {name: os.environ.get(name) for name in variables}
+    os.environ.update(variables)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+def one_thread() -> None:
+    """Keep what heeds no variable to one thread too."""
     import cv2
 
     cv2.setNumThreads(1)
 
 
-def _decider(config: RuntimeConfig, seed: int):
+def make_decider(config: RuntimeConfig, scenario: Scenario, seed: int) -> Decider:
+    """Return the runtime's decider under `config`, told which object `scenario` means, with the generator's `seed`."""
     from z1_runtime.decision import Decider
+    from z1_runtime.perception import Perception
 
     base = _assembled(replace(config, seed=0))
+    config, detector = aim(replace(config, seed=seed), base.perception.detector, scenario)
+    perception = base.perception
+    if detector is not perception.detector:
+        perception = Perception(config.perception, detector, base.T_flange_camera)
     return Decider(
         kinematics=base.kinematics,
-        perception=base.perception,
+        perception=perception,
         generator=base.generator,
         planner=base.planner,
-        config=replace(config, seed=seed),
+        config=config,
         T_flange_camera=base.T_flange_camera,
     )
 
 
 @cache
-def _assembled(config: RuntimeConfig):
+def _assembled(config: RuntimeConfig) -> Decider:
     from z1_runtime.assembly import make_decider
 
     decider = make_decider(config)

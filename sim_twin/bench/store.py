@@ -14,7 +14,7 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from sim_twin.bench.episode import Row
+from sim_twin.bench.rows import Row
 
 FOLDER, TABLE = "episodes", "episodes.parquet"
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from sim_twin.bench.episode import Row
+from sim_twin.bench.rows import Row
 from sim_twin.bench.stats import mcnemar, wilson
 
 CONDITIONS = ("object", "distance", "lateral", "pitch_deg", "occlusion")

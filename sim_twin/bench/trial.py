@@ -1,32 +1,32 @@
-"""Executes a plan in the twin and says, by the twin's own truth, how it ended."""
+"""Executes plans in the twin and says, by the twin's own truth, how they ended."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
+from hal import z1
 from hal.errors import HalError
 from hal.guard import Guard
 from hal.messages import RgbdFrame
 from hal.servo import Servo
 from sim_twin.backends import make_rig
-from sim_twin.bench.watch import Watch
+from sim_twin.bench.watch import KNOCKED_M, KNOCKED_RAD, Watch
 from sim_twin.scene import SceneConfig
 from sim_twin.world import World
 from z1_runtime.executor import Executor, MotionError
 from z1_runtime.kinematics import Kinematics
-from z1_runtime.trajectory import MotionLimits, PathFailure, hold, straight_move
+from z1_runtime.trajectory import MotionLimits, PathFailure, hold, joint_move, straight_move
 from z1_runtime.types import GraspPlan, JointTrajectory
 
 UP_M, SLIP_M, HOLD_S, ASIDE_M = 0.05, 0.02, 1.0, 0.03
 """Success: at least 50 mm up for 1 s after a lift and a 30 mm move aside, and less than 20 mm of slip in the hand."""
-_KNOCKED_M, _KNOCKED_RAD = 0.015, np.radians(15.0)
 _TABLE_N = 5.0
+_FRAME_TIMEOUT_S = 1.0
 
 
 class Mode(StrEnum):
@@ -44,6 +44,10 @@ class Mode(StrEnum):
     DROPPED = "dropped"
     STOPPED = "arm stopped"
     """The servo braked: a limit, a stall, or a joint that did not follow."""
+
+
+RETRIED = (Mode.MISSED, Mode.KNOCKED, Mode.SLIPPED, Mode.DROPPED)
+"""Failures after which another look and another attempt are worth it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -67,40 +71,116 @@ class Outcome:
     """How far the object moved in the hand, from closed to the end [m]."""
     lifted_m: float = np.nan
     """Least height over its start during the last second [m]."""
+    neighbours_knocked: int = 0
+    """Neighbours that were moved by more than 15 mm or 15° since the episode began."""
     duration_s: float = np.nan
     """From the first motion to the end, on the robot's clock [s]."""
     detail: str = ""
     """A sentence, where there is more to say."""
 
 
-@contextmanager
-def robot(scene: SceneConfig) -> Iterator[tuple[Executor, World, Watch]]:
-    """Yield what moves a lock-step arm that stands at home, its world, and an observer."""
-    rig = make_rig(scene, lockstep=True)
-    assert rig.call_every_tick is not None
-    servo, watch = Servo(rig.arm, rig.clock, guard=Guard()), Watch(rig.world)
-    with ExitStack() as undo:
-        servo.connect()
-        undo.callback(servo.disconnect)
-        rig.call_every_tick(servo.tick)
-        rig.call_every_tick(watch.tick)
-        servo.claim("bench")
-        yield Executor(servo, rig.clock), rig.world, watch
+class Robot:
+    """A lock-step arm at home in a scene of its own, with its camera and an impartial observer; use it with `with`."""
+
+    def __init__(self, scene: SceneConfig, kinematics: Kinematics | None = None, speed: float = 0.5) -> None:
+        rig = make_rig(scene, lockstep=True)
+        assert rig.call_every_tick is not None
+        self.world: World = rig.world
+        self._rig, self._undo = rig, ExitStack()
+        self._servo, self._watch = Servo(rig.arm, rig.clock, guard=Guard()), Watch(rig.world)
+        self._executor = Executor(self._servo, rig.clock)
+        self._kinematics, self._limits = kinematics or Kinematics(), MotionLimits.at_speed(speed)
+        self._sees = False
+        rig.call_every_tick(self._servo.tick)
+        rig.call_every_tick(self._watch.tick)
+
+    def __enter__(self) -> Self:
+        self._servo.connect()
+        self._undo.callback(self._servo.disconnect)
+        self._servo.claim("bench")
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._undo.close()
+
+    def look(self) -> tuple[RgbdFrame, np.ndarray]:
+        """Return the camera's next frame and the joints (7,) it was taken at [rad], once the arm rests."""
+        if not self._sees:
+            self._rig.camera.connect()
+            self._undo.callback(self._rig.camera.disconnect)
+            self._sees = True
+        state = self._executor.settle()
+        return self._rig.camera.wait_for_frame(_FRAME_TIMEOUT_S), state.q
+
+    def act(self, plan: GraspPlan) -> Outcome:
+        """Grasp, lift, carry aside and hold; say how it ended."""
+        aside = carry(self._kinematics, plan, self._limits)
+        if aside is None:
+            return Outcome(mode=Mode.NO_PATH, detail="the lifted object cannot be moved 30 mm to any side.")
+        self._watch.begin()
+        start_s = self.world.time_s
+        known: dict[str, Any] = {}
+        try:
+            self._grasp_and_lift(plan, aside, known)
+        except (MotionError, HalError) as error:
+            outcome = Outcome(mode=Mode.STOPPED, detail=str(error), **known)
+        else:
+            outcome = Outcome(mode=Mode.SUCCESS, lifted_m=min(self._watch.lifted_m), **known)
+        outcome = replace(
+            outcome,
+            table_force_n=self._watch.table_force_n,
+            neighbours_knocked=self._watch.neighbours_knocked(),
+            duration_s=self.world.time_s - start_s,
+        )
+        return outcome if outcome.mode is Mode.STOPPED else _judged(outcome)
+
+    def withdraw(self, plan: GraspPlan, outcome: Outcome, jaw_home: float) -> None:
+        """Go home with open jaws after a failed attempt at `plan`; what still hangs in them is put down first.
+
+        Raises:
+            MotionError, HalError: the arm does not get there.
+        """
+        if outcome.mode is Mode.SLIPPED:
+            for motion in (plan.lift, plan.close, plan.approach):
+                self._move_to(motion.q[-1])
+                self._executor.execute(_reversed(motion))
+                self._executor.settle()
+        self._move_to(np.append(z1.Q_HOME, jaw_home))
+
+    def _grasp_and_lift(self, plan: GraspPlan, aside: JointTrajectory, known: dict[str, Any]) -> None:
+        """Do it all, and write into `known` what there is to say as soon as it is known."""
+        watch, executor = self._watch, self._executor
+        for motion in (plan.transfer, plan.approach):
+            executor.execute(motion)
+            executor.settle()
+        known |= {"displacement_m": watch.displacement_m, "tilt_rad": watch.tilt_rad}
+        executor.execute(plan.close)
+        state = executor.settle()
+        closed = watch.T_hand_object()
+        known |= {
+            "jaws_touching": watch.jaws_touching(),
+            "jaw": float(state.q[-1]),
+            "jaw_torque_nm": float(state.tau[-1]),
+        }
+        for motion in (plan.lift, aside):
+            executor.execute(motion)
+            executor.settle()
+        watch.clear()
+        executor.execute(hold(aside.q[-1], HOLD_S))
+        known["slip_m"] = float(np.linalg.norm(watch.T_hand_object()[:3, 3] - closed[:3, 3]))
+
+    def _move_to(self, q_goal: np.ndarray) -> None:
+        """Move straight in joint space from where the arm was last told to be to `q_goal` (7,) [rad]."""
+        q = np.clip(self._servo.status().q_command, z1.Q_MIN, z1.Q_MAX)
+        if np.abs(q - q_goal).max() > 1e-6:
+            self._executor.execute(joint_move(q, q_goal, self._limits))
+            self._executor.settle()
 
 
 def look(scene: SceneConfig) -> tuple[RgbdFrame, np.ndarray]:
     """Return the camera's frame from home and the joints (7,) it was taken at [rad]."""
-    rig = make_rig(scene, lockstep=True)
-    assert rig.call_every_tick is not None
-    servo = Servo(rig.arm, rig.clock, guard=Guard())
-    with ExitStack() as undo:
-        servo.connect()
-        undo.callback(servo.disconnect)
-        rig.call_every_tick(servo.tick)
-        rig.camera.connect()
-        undo.callback(rig.camera.disconnect)
-        state = Executor(servo, rig.clock).settle()
-        return rig.camera.wait_for_frame(1.0), state.q
+    with Robot(scene) as robot:
+        return robot.look()
 
 
 def carry(kinematics: Kinematics, plan: GraspPlan, limits: MotionLimits) -> JointTrajectory | None:
@@ -118,49 +198,9 @@ def carry(kinematics: Kinematics, plan: GraspPlan, limits: MotionLimits) -> Join
     return None
 
 
-def act(
-    scene: SceneConfig, plan: GraspPlan, kinematics: Kinematics, limits: MotionLimits
-) -> tuple[Outcome, np.ndarray]:
-    """Execute `plan` in a fresh world; return how it ended and the final MuJoCo positions (14,)."""
-    aside = carry(kinematics, plan, limits)
-    with robot(scene) as (executor, world, watch):
-        if aside is None:
-            detail = "the lifted object cannot be moved 30 mm to any side."
-            return Outcome(mode=Mode.NO_PATH, detail=detail), world.data.qpos.copy()
-        start_s = world.time_s
-        known: dict[str, Any] = {}
-        closed = None
-        try:
-            for motion in (plan.transfer, plan.approach):
-                executor.execute(motion)
-                executor.settle()
-            known |= {"displacement_m": watch.displacement_m, "tilt_rad": watch.tilt_rad}
-            executor.execute(plan.close)
-            state = executor.settle()
-            closed = watch.T_hand_object()
-            known |= {
-                "jaws_touching": watch.jaws_touching(),
-                "jaw": float(state.q[-1]),
-                "jaw_torque_nm": float(state.tau[-1]),
-            }
-            for motion in (plan.lift, aside):
-                executor.execute(motion)
-                executor.settle()
-            watch.clear()
-            executor.execute(hold(aside.q[-1], HOLD_S))
-        except (MotionError, HalError) as error:
-            known["table_force_n"] = watch.table_force_n
-            return Outcome(mode=Mode.STOPPED, detail=str(error), **known), world.data.qpos.copy()
-        slip_m = float(np.linalg.norm(watch.T_hand_object()[:3, 3] - closed[:3, 3]))
-        outcome = Outcome(
-            mode=Mode.SUCCESS,
-            table_force_n=watch.table_force_n,
-            slip_m=slip_m,
-            lifted_m=min(watch.lifted_m),
-            duration_s=world.time_s - start_s,
-            **known,
-        )
-        return _judged(outcome), world.data.qpos.copy()
+def _reversed(motion: JointTrajectory) -> JointTrajectory:
+    """Return the same motion from its end to its beginning."""
+    return JointTrajectory(t_s=motion.t_s[-1] - motion.t_s[::-1], q=motion.q[::-1], dq=-motion.dq[::-1])
 
 
 def _judged(outcome: Outcome) -> Outcome:
@@ -169,7 +209,7 @@ def _judged(outcome: Outcome) -> Outcome:
         return outcome
     if outcome.table_force_n > _TABLE_N:
         mode = Mode.TABLE_COLLISION
-    elif outcome.displacement_m > _KNOCKED_M or outcome.tilt_rad > _KNOCKED_RAD:
+    elif outcome.displacement_m > KNOCKED_M or outcome.tilt_rad > KNOCKED_RAD:
         mode = Mode.KNOCKED
     elif outcome.jaws_touching < 2:
         mode = Mode.MISSED

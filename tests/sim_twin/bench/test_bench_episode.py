@@ -6,11 +6,10 @@ from sim_twin.bench.episode import run_scenario
 from sim_twin.bench.methods import METHODS
 from sim_twin.bench.runner import make_tasks, run_task
 from sim_twin.bench.scenarios import Scenario
-from sim_twin.bench.trial import Mode, act, look
+from sim_twin.bench.trial import Mode, Robot, look
 from sim_twin.scene import SceneConfig
 from z1_runtime.assembly import make_decider
 from z1_runtime.config import RuntimeConfig
-from z1_runtime.trajectory import MotionLimits
 
 CONFIG = RuntimeConfig(generator="antipodal", detector="tabletop", n_candidates=400)
 SCENARIO = Scenario(object="cylinder", distance="mid", lateral="centre", pitch_deg=0.0)
@@ -23,7 +22,7 @@ def decider():
 
 @pytest.fixture(scope="module")
 def rows(decider):
-    return run_scenario(SCENARIO, list(METHODS.values()), lambda _: decider)
+    return run_scenario(SCENARIO, list(METHODS.values()), lambda *_: decider)
 
 
 def test_every_method_has_a_row_from_the_same_candidates(rows):
@@ -53,14 +52,15 @@ def test_an_object_that_is_not_where_it_was_seen_is_not_called_lifted(decider):
     frame, q = look(SCENARIO.scene())
     plan = decider.decide(frame, q).plan
     elsewhere = SceneConfig(object="cylinder", distance_m=0.60, lateral_m=0.20)
-    outcome, _ = act(elsewhere, plan, decider.kinematics, MotionLimits.at_speed(0.5))
+    with Robot(elsewhere, decider.kinematics) as robot:
+        outcome = robot.act(plan)
     assert outcome.mode is Mode.MISSED
     assert outcome.lifted_m < 0.01
 
 
 def test_an_object_that_cannot_be_seen_is_a_row_too(decider):
     hidden = replace(SCENARIO, occlusion=0.99)
-    (row,) = run_scenario(hidden, [METHODS["mvb"]], lambda _: decider)
+    (row,) = run_scenario(hidden, [METHODS["mvb"]], lambda *_: decider)
     assert row["mode"] == "no detection"
     assert row["detail"]
     assert not row["success"]

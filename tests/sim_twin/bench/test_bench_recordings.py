@@ -1,13 +1,15 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 
 from models.types import GraspSet
-from sim_twin.bench.episode import run_scenario
+from sim_twin.bench.episode import record_scenario, run_scenario
+from sim_twin.bench.methods import METHODS as METHODS_OF_OURS
 from sim_twin.bench.methods import parse_method
 from sim_twin.bench.recordings import Recordings
 from sim_twin.bench.scenarios import Scenario
-from sim_twin.bench.trial import look
 from z1_runtime import blueprint
 from z1_runtime.assembly import make_decider
 from z1_runtime.config import RuntimeConfig
@@ -29,7 +31,7 @@ def test_a_failure_is_recorded_with_what_was_seen_and_ranked(decider, tmp_path, 
     at_the_lens = GraspSet(T_camera_grasps=np.tile(np.eye(4), (3, 1, 1)), scores=np.ones(3), widths_m=np.full(3, 0.04))
     monkeypatch.setattr(type(decider), "propose", lambda self, observation: at_the_lens)
     recordings = Recordings(folder=tmp_path / "recordings", choice="failures")
-    (row,) = run_scenario(SCENARIO, METHODS, lambda _: decider, recordings)
+    (row,) = run_scenario(SCENARIO, METHODS, lambda *_: decider, recordings=recordings)
     assert not row["success"]
     (path,) = (tmp_path / "recordings").iterdir()
     assert path.name == f"{SCENARIO.key}-vanilla_collision_filter_no.rrd"
@@ -37,12 +39,19 @@ def test_a_failure_is_recorded_with_what_was_seen_and_ranked(decider, tmp_path, 
     assert blueprint.GRASP not in entities(path)
 
 
-@pytest.mark.parametrize(("choice", "kept"), [("failures", []), ("all", ["mvb.rrd"])])
-def test_a_success_is_recorded_only_with_all_others(decider, tmp_path, choice, kept):
-    frame, q = look(SCENARIO.scene())
-    decision = decider.decide(frame, q)
-    recordings = Recordings(folder=tmp_path, choice=choice)
-    recordings.keep("mvb", success=True, observation=decision.observation, ranked=decision.ranked, plan=decision.plan)
-    assert [path.name for path in tmp_path.iterdir()] == kept
-    if kept:
-        assert entities(tmp_path / "mvb.rrd") >= {blueprint.BOX, blueprint.GRASP, blueprint.PATH}
+def test_a_chosen_episode_is_recorded_with_its_box_and_plan(decider, tmp_path):
+    path = record_scenario(SCENARIO, METHODS_OF_OURS["mvb"], lambda *_: decider, tmp_path)
+    assert path == tmp_path / f"{SCENARIO.key}-mvb.rrd"
+    assert entities(path) >= {blueprint.BOX, blueprint.GRASP, blueprint.PATH}
+
+
+def test_a_success_is_recorded_only_with_all_others(tmp_path):
+    assert not Recordings(folder=tmp_path, choice="failures").wants(success=True)
+    assert Recordings(folder=tmp_path, choice="failures").wants(success=False)
+    assert Recordings(folder=tmp_path, choice="all").wants(success=True)
+
+
+def test_what_saw_nothing_is_not_recorded(decider, tmp_path):
+    hidden = replace(SCENARIO, occlusion=0.99)
+    assert record_scenario(hidden, METHODS_OF_OURS["mvb"], lambda *_: decider, tmp_path) is None
+    assert not list(tmp_path.iterdir())
