@@ -36,6 +36,7 @@ class Recorder:
 
         Raises:
             ViewerPortError: somebody listens on `port` already.
+            OSError: the file cannot be written.
         """
         self._robot = RobotDrawing()
         self._stream = rr.RecordingStream("z1_grasp")
@@ -49,7 +50,12 @@ class Recorder:
         if port is not None:
             _check_free(port)
             sinks.append(rr.GrpcServerSink(LOOPBACK, port))
-        self._stream.set_sinks(*sinks, default_blueprint=blueprint.make_blueprint())
+        try:
+            self._stream.set_sinks(*sinks, default_blueprint=blueprint.make_blueprint())
+        except RuntimeError as error:
+            raise OSError(
+                f"the recording {out} cannot be written: {error}. Free some room, or write elsewhere."
+            ) from error
         if port is not None:
             _open_viewer(port)
 

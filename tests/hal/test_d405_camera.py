@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from faults_table import FaultsTable
 from plain_source import PlainSource, pinhole_rays, tint, tint_slope
 
 if find_spec("pyrealsense2") is None:
@@ -125,16 +126,19 @@ def test_a_frame_that_is_repeated_is_not_handed_out_again(source: PlainSource, c
     assert camera.wait_for_frame(1.0).sequence > last.sequence
 
 
-def test_a_stale_frame_is_not_handed_out(source: PlainSource, camera: D405Camera) -> None:
+@pytest.mark.faults
+def test_a_stale_frame_is_not_handed_out(source: PlainSource, camera: D405Camera, faults_table: FaultsTable) -> None:
     good = source.expose
     held = []
     source.expose = lambda look: held.append(good(look)) or None  # type: ignore[method-assign]
     with pytest.raises(HalTimeoutError):
         camera.wait_for_frame(0.9)
     source.expose = lambda look: replace(held.pop(0), number=look.number)  # type: ignore[method-assign]
-    with pytest.raises(HalTimeoutError):
+    with pytest.raises(HalTimeoutError) as caught:
         camera.wait_for_frame(0.05)
     assert camera.health.stale >= 1
+    arm = f"waits; {camera.health.stale} stale frame(s) thrown away"
+    faults_table.add("stale frames", arm=arm, reads=caught.value)
     source.expose = good  # type: ignore[method-assign]
     frame = camera.wait_for_frame(1.0)
     assert source.clock.now_s() - frame.stamp_s < 0.05
@@ -167,7 +171,10 @@ def test_a_device_that_hangs_is_reset_and_found_again(
     assert "its hardware was reset" in caplog.text
 
 
-def test_a_camera_that_is_lost_is_found_when_it_is_back(source: PlainSource, camera: D405Camera) -> None:
+@pytest.mark.faults
+def test_a_camera_that_is_lost_is_found_when_it_is_back(
+    source: PlainSource, camera: D405Camera, faults_table: FaultsTable
+) -> None:
     before = camera.wait_for_frame(1.0)
     source.attached = False
     for _ in range(8):
@@ -176,9 +183,14 @@ def test_a_camera_that_is_lost_is_found_when_it_is_back(source: PlainSource, cam
             camera.wait_for_frame(1.0)
         assert source.clock.now_s() - called_s == pytest.approx(1.0, abs=0.01)
     assert "it fell silent, and it is looked for on the bus" in str(caught.value)
-    source.attached = True
+    source.attached, back_s = True, source.clock.now_s()
     wait_through(camera, 3.0)
     after = camera.wait_for_frame(1.0)
+    faults_table.add(
+        "USB camera lost, and back",
+        arm=f"waits for frames, which come again {after.stamp_s - back_s:.1f} s after the camera is back",
+        reads=caught.value,
+    )
     assert camera.health.found_again == 1
     assert source.resets == 0
     assert after.sequence > before.sequence
@@ -194,13 +206,21 @@ def test_one_that_nobody_asks_is_never_reset(source: PlainSource, camera: D405Ca
     assert (camera.health.restarts, camera.health.resets) == (0, 0)
 
 
+@pytest.mark.faults
 def test_a_jump_of_the_systems_time_does_not_stop_it(
-    source: PlainSource, camera: D405Camera, monkeypatch: pytest.MonkeyPatch
+    source: PlainSource,
+    camera: D405Camera,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    faults_table: FaultsTable,
 ) -> None:
     camera.wait_for_frame(1.0)
+    jumped_s = source.clock.now_s()
     monkeypatch.setattr("hal.backends.d405_camera.unix_offset_s", lambda clock: 1.6e9 + 3600.0)
     frame = camera.wait_for_frame(2.0)
     assert 0.0 <= source.clock.now_s() - frame.stamp_s < 0.1
+    arm = f"goes on; the next frame is {frame.stamp_s - jumped_s:.2f} s later"
+    faults_table.add("the system's time jumps by 1 h", arm=arm, reads=caplog.records[-1].getMessage())
     assert camera.health.resets == 0
 
 

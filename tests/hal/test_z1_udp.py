@@ -8,6 +8,7 @@ from threading import Event, Thread
 
 import numpy as np
 import pytest
+from faults_table import FaultsTable
 from z1_peer import FakeController, serving
 
 from hal import z1
@@ -78,12 +79,16 @@ def test_with_nobody_there_the_address_and_the_remedy_are_named() -> None:
     assert Z1ArmConfig().connect_timeout_s <= 2.5  # of the three seconds that `--real` may take to say so
 
 
-def test_a_second_client_is_refused_and_the_first_goes_on(peer: FakeController, config: Z1ArmConfig) -> None:
+@pytest.mark.faults
+def test_a_second_client_is_refused_and_the_first_goes_on(
+    peer: FakeController, config: Z1ArmConfig, faults_table: FaultsTable
+) -> None:
     first, second = Z1Arm(WallClock(), config), Z1Arm(WallClock(), config)
     first.connect()
-    with pytest.raises(LeaseError, match="another program talks to this controller already"):
+    with pytest.raises(LeaseError, match="another program talks to this controller already") as refused:
         second.connect()
     assert first.read_state().q == pytest.approx(peer.q, abs=1e-3)
+    faults_table.add("second HAL on the arm's ports", arm="goes on with the first", reads=refused.value)
     first.disconnect()
     second.connect()
     second.disconnect()

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import socket
+import subprocess
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from threading import Event
 
 import numpy as np
@@ -20,6 +24,8 @@ from hal.messages import ServoMode, TrajectoryChunk
 from hal.servo import Servo
 from hal.servo_thread import ServoThread
 from hal.z1 import N_JOINTS, Q_HOME
+
+ROOT = Path(__file__).parents[3]
 
 
 @dataclass
@@ -40,10 +46,13 @@ def free_config(**options) -> BusConfig:
     return BusConfig(port=port, **options)
 
 
-def slow_motion(trajectory_id: int = 1, duration_s: float = 3.0) -> TrajectoryChunk:
-    """Joint 1 turns 0.6 rad from home, smoothly."""
+HOME = np.append(Q_HOME, 0.0)
+
+
+def slow_motion(trajectory_id: int = 1, duration_s: float = 3.0, start: np.ndarray = HOME) -> TrajectoryChunk:
+    """Joint 1 turns 0.6 rad from `start`, smoothly."""
     s = np.linspace(0.0, 1.0, int(50 * duration_s) + 1)
-    q = np.tile(np.append(Q_HOME, 0.0), (len(s), 1))
+    q = np.tile(start, (len(s), 1))
     dq = np.zeros((len(s), N_JOINTS))
     q[:, 0] += 0.6 * (3 * s**2 - 2 * s**3)
     dq[:, 0] = 0.6 * (6 * s - 6 * s**2) / duration_s
@@ -58,6 +67,27 @@ def wait_until(condition, timeout_s: float = 10.0):
         assert clock.now_s() < give_up_s, "waited in vain"
         pause.wait(0.005)
     return value
+
+
+def start_python(code: str, *arguments: object) -> subprocess.Popen:
+    """Start a Python program that finds this tree's packages; its streams are pipes of text."""
+    return subprocess.Popen(
+        [sys.executable, "-c", code, *map(str, arguments)],
+        cwd=ROOT,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )
+
+
+def end_processes(*processes: subprocess.Popen | None) -> None:
+    """Kill them, and wait until they are gone."""
+    for process in processes:
+        if process is not None:
+            process.kill()
+            process.communicate()
 
 
 def moving(servo) -> bool:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import zenoh
 from conftest import moving, slow_motion, wait_until
+from faults_table import FaultsTable, describe
 
 from hal.arm import ServoedArm
 from hal.bus import keys
@@ -85,11 +86,15 @@ def test_a_setpoint_comes_back_as_it_was_applied(remote_arm):
     assert 0 < applied.q[0] < 0.1
 
 
-def test_the_lease_names_its_holder_to_the_second_client_and_can_be_handed_over(hal, remote_arm):
+@pytest.mark.faults
+def test_the_lease_names_its_holder_to_the_second_client_and_can_be_handed_over(
+    hal, remote_arm, faults_table: FaultsTable
+):
     with RemoteArm(hal.config, owner="rival") as rival:
         remote_arm.claim()
-        with pytest.raises(LeaseError, match="tester-"):
+        with pytest.raises(LeaseError, match="tester-") as refused:
             rival.claim()
+        faults_table.add("second client of the HAL", arm="obeys the first alone", reads=refused.value)
         with pytest.raises(LeaseError, match="tester-"):
             rival.stream(slow_motion())
         rival.release()
@@ -112,15 +117,22 @@ def test_the_heartbeat_keeps_a_motion_alive_well_beyond_the_servos_patience(remo
     assert wait_until(lambda: (s := remote_arm.status()).mode is not ServoMode.TRACKING and s).finished
 
 
-def test_disconnecting_in_motion_brakes_and_frees_the_lease(hal, remote_arm):
+@pytest.mark.faults
+def test_disconnecting_in_motion_brakes_and_frees_the_lease(hal, remote_arm, faults_table: FaultsTable):
     remote_arm.claim()
     remote_arm.stream(slow_motion())
     wait_until(lambda: moving(hal.servo))
+    gone_s, q = WallClock().now_s(), hal.arm.read_state().q
     remote_arm.disconnect()
-    wait_until(lambda: hal.servo.status().mode is ServoMode.HOLDING)
-    status = hal.servo.status()
+    status = wait_until(lambda: (s := hal.servo.status()).mode is ServoMode.HOLDING and s)
     assert not status.finished
     assert status.owner == ""
+    faults_table.add(
+        "client gone, in order",
+        arm=describe(status, hal.arm.read_state().q - q),
+        rest_s=status.stamp_s - gone_s,
+        reads=status.reason,
+    )
 
 
 def test_refusals_cross_the_link_as_their_own_classes(remote_arm):

@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-import os
 import re
 import signal
 import subprocess
-import sys
-from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import free_config, moving, wait_until
+from conftest import end_processes, free_config, moving, start_python, wait_until
+from faults_table import FaultsTable, describe
 
 from hal.bus.client import RemoteArm, RemoteCamera
 from hal.clock import WallClock
 from hal.errors import HalTimeoutError
 from hal.messages import ArmSetpoint, ServoMode
 
-ROOT = Path(__file__).parents[3]
 BRAKED_WITHIN_S = 0.4
 """The safety requirement: from the death of the commanding process to the arm at rest [s]."""
 
@@ -86,25 +83,6 @@ serve(make_rig(), config, end, on_ready=look)
 """
 
 
-def _start(code: str, *arguments: object) -> subprocess.Popen:
-    return subprocess.Popen(
-        [sys.executable, "-c", code, *map(str, arguments)],
-        cwd=ROOT,
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-    )
-
-
-def _end(*processes: subprocess.Popen | None) -> None:
-    for process in processes:
-        if process is not None:
-            process.kill()
-            process.communicate()
-
-
 @pytest.fixture
 def recorded(hal, monkeypatch):
     """Every setpoint that reaches the arm, with its time."""
@@ -126,22 +104,30 @@ def _last_motion_s(sent: list[tuple[float, np.ndarray]]) -> float:
     return sent[int(np.flatnonzero(changed)[-1]) + 1][0]
 
 
-def test_a_killed_runtime_leaves_an_arm_that_brakes_and_holds(hal, recorded):
-    runtime = _start(MOVE, hal.config.port, Path(__file__).parent)
+@pytest.mark.faults
+def test_a_killed_runtime_leaves_an_arm_that_brakes_and_holds(hal, recorded, faults_table: FaultsTable):
+    runtime = start_python(MOVE, hal.config.port, Path(__file__).parent)
     try:
         wait_until(lambda: moving(hal.servo), 30.0)
-        killed_s = WallClock().now_s()
+        killed_s, q = WallClock().now_s(), hal.arm.read_state().q
     finally:
-        _end(runtime)
-    wait_until(lambda: hal.servo.status().mode is ServoMode.HOLDING)
-    status = hal.servo.status()
+        end_processes(runtime)
+    braking = wait_until(lambda: (s := hal.servo.status()).mode is not ServoMode.TRACKING and s)
+    status = wait_until(lambda: (s := hal.servo.status()).mode is ServoMode.HOLDING and s)
     assert "heartbeat" in status.reason
     assert not status.finished
     assert killed_s < _last_motion_s(recorded) <= killed_s + BRAKED_WITHIN_S
+    faults_table.add(
+        "runtime killed",
+        arm=describe(status, hal.arm.read_state().q - q),
+        noticed_s=braking.stamp_s - killed_s,
+        rest_s=_last_motion_s(recorded) - killed_s,
+        reads=status.reason,
+    )
 
 
 def test_a_stop_from_another_process_holds_a_moving_arm_until_rearmed(hal, recorded):
-    runtime = _start(MOVE, hal.config.port, Path(__file__).parent)
+    runtime = start_python(MOVE, hal.config.port, Path(__file__).parent)
     try:
         wait_until(lambda: moving(hal.servo), 30.0)
         with RemoteArm(hal.config, owner="z1 stop") as bystander:
@@ -153,7 +139,7 @@ def test_a_stop_from_another_process_holds_a_moving_arm_until_rearmed(hal, recor
             assert _last_motion_s(recorded) <= stopped_s + BRAKED_WITHIN_S
             assert runtime.poll() is None
     finally:
-        _end(runtime)
+        end_processes(runtime)
 
 
 def _shared_memory_of(process: subprocess.Popen) -> set[Path]:
@@ -168,12 +154,12 @@ def _shared_memory_of(process: subprocess.Popen) -> set[Path]:
 )
 def test_frames_cross_in_shared_memory_of_which_nothing_is_left_once_both_processes_have_ended(manners, number):
     config = free_config()
-    server = _start(SERVE, config.port)
+    server = start_python(SERVE, config.port)
     client = None
     try:
         assert server.stdout is not None
         assert server.stdout.readline() == "ready\n"
-        client = _start(LOOK, config.port, manners)
+        client = start_python(LOOK, config.port, manners)
         assert client.stdout is not None
         assert client.stdout.readline() == "through shared memory\n"
         mapped = _shared_memory_of(server) | _shared_memory_of(client)
@@ -186,38 +172,49 @@ def test_frames_cross_in_shared_memory_of_which_nothing_is_left_once_both_proces
         assert server.returncode == 0
         assert [path for path in mapped if path.exists()] == []
     finally:
-        _end(server, client)
+        end_processes(server, client)
 
 
 def test_the_second_server_of_a_process_shares_memory_as_the_first():
-    process = _start(SERVE_TWICE, free_config().port)
+    process = start_python(SERVE_TWICE, free_config().port)
     try:
         output, errors = process.communicate(timeout=60)
         assert (output, process.returncode) == ("True\n", 0), errors
     finally:
-        _end(process)
+        end_processes(process)
 
 
+@pytest.mark.faults
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_hal_process_told_to_end_in_motion_brakes_first(number):
+def test_a_hal_process_told_to_end_in_motion_brakes_first(number, faults_table: FaultsTable):
     config = free_config(connect_timeout_s=20.0)
-    process = _start(SERVE, config.port)
+    process = start_python(SERVE, config.port)
     runtime = None
     try:
         assert process.stdout is not None
         assert process.stdout.readline() == "ready\n"
         with RemoteArm(config) as arm, RemoteCamera(config) as camera:
-            runtime = _start(MOVE, config.port, Path(__file__).parent)
+            runtime = start_python(MOVE, config.port, Path(__file__).parent)
             wait_until(lambda: moving(arm), 30.0)
             camera.wait_for_frame(5.0)
             process.send_signal(number)
-            last = arm.read_state()
+            states, reads = [arm.read_state()], ""
             while process.poll() is None:
-                with suppress(HalTimeoutError):
-                    last = arm.read_state()
+                try:
+                    states.append(arm.read_state())
+                except HalTimeoutError as error:
+                    reads = str(error)
             assert process.stdout.read() == "ended\n"
             assert process.returncode == 0
+        first, last = states[0], states[-1]
         assert np.abs(last.dq).max() < 0.01
         assert 0.0 < last.q[0] < 0.5, "the motion of 0.6 rad was cut short"
+        moving_s = [state.stamp_s for state in states if np.abs(state.dq).max() > 0.01]
+        faults_table.add(
+            f"HAL told to end by {signal.Signals(number).name}",
+            arm=f"brakes and holds; joint1 {1e3 * abs(last.q[0] - first.q[0]):.0f} mrad further",
+            rest_s=max(moving_s) - first.stamp_s,
+            reads=reads,
+        )
     finally:
-        _end(process, runtime)
+        end_processes(process, runtime)
