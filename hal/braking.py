@@ -6,10 +6,12 @@ import numpy as np
 from ruckig import ControlInterface, InputParameter, Ruckig, Synchronization, Trajectory
 
 from hal.limits import ServoLimits
+from hal.playback import Playback
 from hal.z1 import CONTROL_PERIOD_S, N_JOINTS
 
 _HARDER = 1.25
 _ATTEMPTS = 10
+_SHORTEST_S = 10 * CONTROL_PERIOD_S
 
 
 class Brake:
@@ -65,6 +67,33 @@ class StopPath:
         """Return position and velocity (7,) `t_s` [s] after the stop began."""
         q, dq, _ = self._path.at_time(min(t_s, self.duration_s))
         return np.array(q), np.array(dq)
+
+
+class PathStop:
+    """A stop on the path that is being played: its time runs ever slower, and the arm stays where it was to be."""
+
+    def __init__(self, path: Playback, start_s: float, duration_s: float) -> None:
+        self._path, self._start_s = path, start_s
+        self.duration_s = duration_s
+        """How long it takes [s]; the path's own time goes on by half of that."""
+
+    def at(self, t_s: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return position and velocity (7,) `t_s` [s] after the stop began."""
+        u = min(t_s / self.duration_s, 1.0)
+        q, dq = self._path.at(self._start_s + self.duration_s * (u - u**3 + 0.5 * u**4))
+        return q, (1.0 - 3.0 * u**2 + 2.0 * u**3) * dq
+
+
+def plan_path_stop(path: Playback, start_s: float, limits: ServoLimits) -> PathStop | None:
+    """Return the stop on `path` from its time `start_s` [s]; None where too little of it is left to stop on.
+
+    It takes as long as the limits of acceleration and jerk want for the speed there, but no longer than `brake_s`.
+    """
+    speed = np.abs([path.at(start_s + share * limits.brake_s)[1] for share in (0.0, 0.25, 0.5)]).max(axis=0)
+    # What slowing down asks of a joint at most: 3/2 v/T and 6 v/T².
+    wanted_s = np.max([1.5 * speed / limits.ddq_max, np.sqrt(6.0 * speed / limits.dddq_max)])
+    duration_s = min(max(float(wanted_s), _SHORTEST_S), limits.brake_s)
+    return PathStop(path, start_s, duration_s) if start_s + 0.5 * duration_s <= path.end_s else None
 
 
 class Chaser:

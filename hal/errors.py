@@ -45,6 +45,10 @@ class StoppedError(CommandRefusedError):
         super().__init__(f"the arm is stopped ({reason}); look at it, then re-arm with `./z1 rearm`.")
 
 
+class GuardError(CommandRefusedError):
+    """The command leads where the arm may not be: out of its workspace, below the table, or into itself."""
+
+
 class LeaseError(CommandRefusedError):
     """Another process owns the arm, or this one has lost it."""
 

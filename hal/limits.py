@@ -12,6 +12,7 @@ from hal.errors import InvalidMessageError
 from hal.messages import frozen_array
 
 _GRIPPER = z1.N_ARM
+_MEASURED = 0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -37,7 +38,7 @@ class ServoLimits:
     following_error_rad: float = 0.3
     """An arm joint further than this from its command is blocked [rad]."""
     overload_fraction: float = 0.98
-    """A motor above this part of `tau_max` for `overload_s` is overloaded."""
+    """A motor above this part of `tau_max` for `overload_s` is overloaded, and so is one asked for all of it."""
     overload_s: float = 0.1
     """See `overload_fraction` [s]."""
     brake_s: float = 0.24
@@ -111,28 +112,40 @@ def find_blocked(limits: ServoLimits, q_command: np.ndarray, q_measured: np.ndar
 
 
 class OverloadWatch:
-    """Counts how long a motor has been at its torque limit."""
+    """Counts how long a motor has been at its torque limit, or asked for more than that."""
 
     def __init__(self, limits: ServoLimits) -> None:
-        self._level = limits.overload_fraction * limits.tau_max[:_GRIPPER]
+        tau_max = limits.tau_max[:_GRIPPER]
+        self._levels = np.stack([limits.overload_fraction * tau_max, tau_max])
         self._allowed_ticks = round(limits.overload_s / z1.CONTROL_PERIOD_S)
-        self._ticks = np.zeros(_GRIPPER, dtype=int)
+        self._ticks = np.zeros(self._levels.shape, dtype=int)
 
-    def update(self, tau: np.ndarray) -> str:
-        """Take the torques (7,) [Nm] of this tick; say which arm joint is overloaded, empty when none is.
+    def update(self, tau: np.ndarray, asked: np.ndarray) -> str:
+        """Take this tick's torques; say which arm joint is overloaded, empty when none is.
 
         The gripper is left out: it is meant to push for as long as it holds something.
+
+        Args:
+            tau: (7,) measured [Nm].
+            asked: (7,) what the position servos make of the command [Nm] (`servo_torque`).
         """
-        over = np.abs(tau[:_GRIPPER]) >= self._level
+        over = np.abs(np.stack([tau[:_GRIPPER], asked[:_GRIPPER]])) >= self._levels
         if not over.any():
             self._ticks[:] = 0
             return ""
         self._ticks += 1
         self._ticks *= over
-        worst = int(self._ticks.argmax())
-        if self._ticks[worst] <= self._allowed_ticks:
+        if self._ticks.max() <= self._allowed_ticks:
             return ""
-        return (
-            f"{z1.JOINT_NAMES[worst]} has been at its torque limit ({tau[worst]:.1f} Nm) for more than "
-            f"{self._allowed_ticks * z1.CONTROL_PERIOD_S:.2f} s"
-        )
+        kind, joint = np.unravel_index(int(self._ticks.argmax()), self._ticks.shape)
+        allowed_nm, allowed_s = self._levels[kind, joint], self._allowed_ticks * z1.CONTROL_PERIOD_S
+        if kind == _MEASURED:
+            what = f"has been at its torque limit ({tau[joint]:.1f} Nm of {allowed_nm:.1f})"
+        else:
+            what = f"does not follow: its command has asked for {asked[joint]:.1f} Nm (allowed {allowed_nm:.1f})"
+        return f"{z1.JOINT_NAMES[joint]} {what} for more than {allowed_s:.2f} s: it is blocked, overloaded or lost"
+
+
+def servo_torque(q_command: np.ndarray, q_measured: np.ndarray) -> np.ndarray:
+    """Return the torques (7,) [Nm] that the arm's position servos make of a command (7,) [rad] beside gravity's."""
+    return z1.KP * (q_command - q_measured)

@@ -198,3 +198,35 @@ class ServoStatus:
 
     def __post_init__(self) -> None:
         _freeze(self, q_command=(float, (N_JOINTS,)))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ServoHealth:
+    """How well the servo does its work, published once a second; all figures are measured."""
+
+    stamp_s: float
+    """When this was written [s]."""
+    mode: ServoMode
+    """What it is doing."""
+    faults: tuple[str, ...]
+    """Why it is stopped, or else what the arm reports; empty when all is well."""
+    rate_hz: float
+    """Cycles a second, of the last minute; this and the periods are 0 while unmeasured (lock-step)."""
+    period_ms_p50: float
+    """Median of the last minute's periods [ms]."""
+    period_ms_p99: float
+    """99th percentile of the same [ms]."""
+    period_ms_p999: float
+    """99.9th percentile [ms]."""
+    period_ms_max: float
+    """Longest [ms]."""
+    ticks: int
+    """Cycles since the start."""
+    overruns: int
+    """Cycles that began more than half a period late."""
+    owner: str
+    """Who holds the command lease; empty when nobody does."""
+    command_age_s: float
+    """Since the owner was last heard, by a command or its heartbeat [s]; 0 while nobody holds the lease."""
+    real_time: tuple[str, ...]
+    """What the machine granted the servo's thread, such as SCHED_FIFO; empty = it shares its core as any other."""

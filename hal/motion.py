@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hal.braking import Blend, Brake, Chaser, StopPath
+from hal.braking import Blend, Brake, Chaser, PathStop, StopPath, plan_path_stop
 from hal.limits import ServoLimits
 from hal.messages import ServoMode
 from hal.playback import Playback
@@ -12,6 +12,7 @@ from hal.z1 import CONTROL_PERIOD_S, N_ARM, N_JOINTS
 
 _AT_REST_RAD_S = 0.02
 _GIVE_WAY_RAD = 0.01
+_ON_PATH_RAD = 1e-6
 _ZERO = np.zeros(N_JOINTS)
 _ZERO.setflags(write=False)
 
@@ -46,7 +47,7 @@ class Motion:
         self._dq = self._ddq = _ZERO
         # A difference of speeds lags by half a tick, which is enough to make a chase swing about its target.
         self._chase_ddq: np.ndarray | None = None
-        self._stop_path: StopPath | None = None
+        self._stop_path: StopPath | PathStop | None = None
         self._blend: Blend | None = None
         self._since_s = 0.0  # ticks since the stop path or the blend began
 
@@ -95,10 +96,20 @@ class Motion:
         path = self._brake.plan(self.q, self._dq, self._ddq)
         return path.at(path.duration_s)[0]
 
-    def brake(self, reason: str) -> None:
-        """Begin to stop from the present command."""
+    def brake(self, reason: str, along: Playback | None = None) -> None:
+        """Begin to stop from the present command: on the path `along`, if that is what is being played and enough of it
+        is left, else every joint by itself."""
+        stop = None
+        if along is not None and self._is_on(along):
+            stop = plan_path_stop(along, self.time_s, self._limits)
         self.mode, self.reason, self._blend, self._chase_ddq = ServoMode.BRAKING, reason, None, None
-        self._stop_path, self._since_s = self._brake.plan(self.q, self._dq, self._ddq), 0.0
+        self._stop_path, self._since_s = stop or self._brake.plan(self.q, self._dq, self._ddq), 0.0
+
+    def _is_on(self, path: Playback) -> bool:
+        """Whether the last command was a point of `path`: nothing blended into it, nothing clipped off it."""
+        if path.trajectory_id != self.trajectory_id or self.mode is not ServoMode.TRACKING or self._blend is not None:
+            return False
+        return bool(np.abs(path.at(self.time_s)[0] - self.q).max() < _ON_PATH_RAD)
 
     def rest(self) -> Wish:
         """Brake if that is not over, else hold."""

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hal import playback
-from hal.errors import CommandRefusedError, StoppedError
+from hal.errors import CommandRefusedError, GuardError, StoppedError
 from hal.guard import Guard
 from hal.lease import Lease
 from hal.limits import ServoLimits
@@ -80,6 +80,8 @@ class Orders:
             """Trajectories up to this one are over because the tick said so."""
             self.cancel_reason = ""
             """Why the last one was cut short by a producer."""
+            self.dead_end: dict[int, str] = {}
+            """The trajectory a later piece of which leads where the arm may not be, and why; replaced, not changed."""
             self.rearmed = False
             """Set by `rearm`, taken by the tick."""
             self.beyond = 0
@@ -142,7 +144,12 @@ class Orders:
             if running is not None and chunk.trajectory_id == running.trajectory_id:
                 played_s = snapshot.time_s if snapshot.trajectory_id == running.trajectory_id else 0.0
                 extended = playback.extend(running, chunk, played_s, self._limits)
-                self._check_space(extended, chunk, snapshot)
+                try:
+                    self._check_space(extended, chunk, snapshot)
+                except GuardError as error:
+                    # The rest will not come: what is buffered is for braking on.
+                    self.dead_end = {chunk.trajectory_id: str(error)}
+                    raise
                 self.playback = extended
                 return
             newest = max(self.done_id, self.playback.trajectory_id if self.playback else 0)
@@ -164,7 +171,7 @@ class Orders:
             if running is not None:
                 raise CommandRefusedError(f"trajectory {running.trajectory_id} is playing; let it end or release() it.")
             if self._guard and (refusal := self._guard.refusal(setpoint.q[None], snapshot.q_sent)):
-                raise CommandRefusedError(f"the setpoint {refusal[1]}.")
+                raise GuardError(f"the setpoint {refusal[1]}.")
             self.target = Target(setpoint, now_s)
             self.beyond += bool(((setpoint.q < self._limits.q_min) | (setpoint.q > self._limits.q_max)).any())
 
@@ -189,9 +196,7 @@ class Orders:
         refusal = self._guard.refusal(new.sampled(start_s, _CHECK_EVERY_S), snapshot.q_sent)
         if refusal is not None:
             index, what = refusal
-            raise CommandRefusedError(
-                f"trajectory {chunk.trajectory_id} {what} (t = {start_s + index * _CHECK_EVERY_S:.2f} s)."
-            )
+            raise GuardError(f"trajectory {chunk.trajectory_id} {what} (t = {start_s + index * _CHECK_EVERY_S:.2f} s).")
 
     def _check_start(self, chunk: TrajectoryChunk, snapshot: Snapshot) -> None:
         # A squeezing gripper's command leads its measurement, so there the command counts, before or after limits.

@@ -2,11 +2,24 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from hal.z1 import CONTROL_PERIOD_S
 
 _SUMMARY_TICKS = 500
+
+
+class PeriodSummary(NamedTuple):
+    """What the last periods amount to; zeros while nothing is measured. All but the rate are values that occurred."""
+
+    rate_hz: float = 0.0
+    """Cycles a second."""
+    p50_ms: float = 0.0
+    p99_ms: float = 0.0
+    p999_ms: float = 0.0
+    max_ms: float = 0.0
 
 
 class PeriodStatistics:
@@ -17,7 +30,7 @@ class PeriodStatistics:
         self._filled = 0
         self._next = 0
         self._last_s: float | None = None
-        self._summary_ms = (0.0, 0.0)
+        self._summary = PeriodSummary()
         self._due_ticks = 0
         self.ticks = 0
         """Cycles since the start."""
@@ -46,15 +59,16 @@ class PeriodStatistics:
             self._next = (self._next + 1) % len(self._ring_s)
             self._filled = min(self._filled + 1, len(self._ring_s))
 
-    def summary_ms(self) -> tuple[float, float]:
-        """Return median and 99.9th percentile of the recorded periods [ms]; zeros while nothing is recorded.
+    def summary(self) -> PeriodSummary:
+        """Return what the recorded periods amount to.
 
-        Both are values that occurred (nearest rank). Partitioning the ring takes the interpreter from the tick, so
-        the answer is kept for `_SUMMARY_TICKS`; `np.percentile` would take 57 ms for its first call.
+        Partitioning the ring takes the interpreter from the tick, so the answer is kept for `_SUMMARY_TICKS`;
+        `np.percentile` would take 57 ms for its first call.
         """
         if self._filled and self.ticks >= self._due_ticks:
             self._due_ticks = self.ticks + _SUMMARY_TICKS
-            ranks = [round(share * (self._filled - 1)) for share in (0.5, 0.999)]
-            parted = np.partition(self._ring_s[: self._filled], ranks)
-            self._summary_ms = (1e3 * float(parted[ranks[0]]), 1e3 * float(parted[ranks[1]]))
-        return self._summary_ms
+            ring_s = self._ring_s[: self._filled]
+            ranks = [round(share * (self._filled - 1)) for share in (0.5, 0.99, 0.999, 1.0)]
+            parted_ms = 1e3 * np.partition(ring_s, ranks)[ranks]  # nearest rank
+            self._summary = PeriodSummary(self._filled / float(ring_s.sum()), *parted_ms.tolist())
+        return self._summary

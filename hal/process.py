@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
 import os
 import signal
@@ -15,9 +16,11 @@ from hal.errors import HalError
 from hal.guard import Guard, Workspace
 from hal.limits import ServoLimits
 from hal.messages import ServoMode
+from hal.parking import Parking, park
+from hal.readonly import ReadonlyServo
 from hal.rig import Rig
 from hal.servo import Servo
-from hal.servo_thread import ServoThread
+from hal.servo_thread import ServoThread, collect_garbage
 from hal.z1 import CONTROL_PERIOD_S
 
 _LOG = logging.getLogger(__name__)
@@ -25,16 +28,19 @@ HEARTBEAT_TIMEOUT_S = 0.15
 """How long the owner may be silent in motion [s]."""
 _BRAKING_S = 2.0
 _LOOK_S = 0.05
+_COLLECT_EVERY = 100
 
 
-def stop_on_signals(stop_event: Event) -> None:
-    """Set `stop_event` at SIGTERM, SIGINT and SIGHUP; for the main thread, before `serve`."""
+def stop_on_signals(stop_event: Event, hurry_event: Event | None = None) -> None:
+    """Set `stop_event` at SIGTERM, SIGINT and SIGHUP, and `hurry_event` at the next of them; for the main thread,
+    before `serve`."""
     # A handler interrupts the main thread, which may hold the event's own lock: another thread has to set it.
     heard, told = os.pipe()
 
     def wait() -> None:
-        os.read(heard, 1)
-        stop_event.set()
+        for event in filter(None, (stop_event, hurry_event)):
+            os.read(heard, 1)
+            event.set()
 
     Thread(target=wait, name="signals", daemon=True).start()
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
@@ -50,8 +56,10 @@ def serve(
     limits: ServoLimits | None = None,
     workspace: Workspace | None = None,
     cpu: int | None = None,
+    hurry_event: Event | None = None,
+    readonly: bool = False,
 ) -> None:
-    """Serve `rig` until `stop_event` is set, then brake, hold and let go of everything.
+    """Serve `rig` until `stop_event` is set, then brake, park if the rig says so, hold and let go of everything.
 
     Args:
         rig: not yet connected, living by the wall clock.
@@ -61,6 +69,8 @@ def serve(
         limits: of the servo; None = the Z1's.
         workspace: where the arm may be; None = above its table.
         cpu: the core for the servo thread; None = any.
+        hurry_event: ends the parking, too: the arm then holds where it is.
+        readonly: measure and publish only; the arm is neither commanded nor stopped nor parked.
 
     Raises:
         HalError: a device does not answer, the port is taken, or the servo or the server failed while running.
@@ -69,22 +79,29 @@ def serve(
     if rig.call_every_tick is not None:
         raise ValueError("a lock-step rig has no time of its own to be served by; make it with the wall clock.")
     guard = Guard(workspace)
-    servo = Servo(rig.arm, rig.clock, limits, heartbeat_timeout_s=HEARTBEAT_TIMEOUT_S, guard=guard)
+    kind = ReadonlyServo if readonly else Servo
+    servo = kind(rig.arm, rig.clock, limits, heartbeat_timeout_s=HEARTBEAT_TIMEOUT_S, guard=guard)
     ticking = ServoThread(servo, rig.clock, cpu=cpu)
+    ending = _Ending(servo, ticking, rig.park, hurry_event or Event())
     with ExitStack() as undo:  # in reverse order, whatever of it was reached
-        servo.connect()
+        connect(servo, rig)
         undo.callback(servo.disconnect)
-        rig.camera.connect()
+        undo.callback(ending.soften)
         undo.callback(rig.camera.disconnect)
         ticking.start()
         undo.callback(ticking.stop)
         _await_first_tick(servo, ticking)
         server = undo.enter_context(HalServer(servo, rig.camera, rig.clock, config))
-        undo.callback(_come_to_rest, servo, ticking)
+        if not readonly:
+            undo.callback(ending.come_to_rest)
         _LOG.info("serving robot %s at %s", config.robot, config.endpoint)
         if on_ready is not None:
             on_ready()
-        while not stop_event.wait(_LOOK_S) and ticking.alive:
+        for look in itertools.count(1):
+            if stop_event.wait(_LOOK_S) or not ticking.alive:
+                break
+            if look % _COLLECT_EVERY == 0:
+                collect_garbage(servo)
             if server.failed.is_set():
                 raise HalError("a thread of the link's server died; its traceback is above. The arm is being stopped.")
 
@@ -96,11 +113,70 @@ def _await_first_tick(servo: Servo, ticking: ServoThread) -> None:
         pause.wait(CONTROL_PERIOD_S)
 
 
-def _come_to_rest(servo: Servo, ticking: ServoThread) -> None:
-    """Brake while the servo still ticks; clients see it happen, and can command nothing any more."""
-    servo.stop("the HAL process is ending")
-    pause = Event()
-    waited_s = 0.0
-    while ticking.alive and servo.status().mode is not ServoMode.STOPPED and waited_s < _BRAKING_S:
-        pause.wait(_LOOK_S)
-        waited_s += _LOOK_S
+def connect(servo: Servo, rig: Rig) -> None:
+    """Connect arm and camera; independent ones at the same time, so that whoever has neither learns it of both at once.
+
+    Raises:
+        HalError: of the one that does not answer, or what both say; nothing is left open.
+    """
+    looking = _Attempt(rig.camera.connect)
+    if rig.independent:
+        looking.start()
+    try:
+        servo.connect()
+    except HalError as error:
+        if not rig.independent:
+            raise
+        looking.join()
+        if looking.error is None:
+            rig.camera.disconnect()
+            raise
+        raise HalError(f"arm: {error} camera: {looking.error}") from error
+    if not rig.independent:
+        looking.run()
+    else:
+        looking.join()
+    if looking.error is not None:
+        servo.disconnect()
+        raise looking.error
+
+
+class _Attempt(Thread):
+    """A call, in a thread or not, that keeps what it raises."""
+
+    def __init__(self, call: Callable[[], None]) -> None:
+        super().__init__(name="attempt", daemon=True)
+        self._call = call
+        self.error: Exception | None = None
+
+    def run(self) -> None:
+        try:
+            self._call()
+        except Exception as error:  # of every kind: it is raised where it is waited for
+            self.error = error
+
+
+class _Ending:
+    """What is done with the arm once the process is to end."""
+
+    def __init__(self, servo: Servo, ticking: ServoThread, parking: Parking | None, hurry: Event) -> None:
+        self._servo, self._ticking = servo, ticking
+        self._parking, self._hurry = parking, hurry
+        self._parked = False
+
+    def come_to_rest(self) -> None:
+        """Brake, and park if that is wanted, while the servo still ticks; clients see it happen, and may stop it."""
+        if self._parking is not None and self._ticking.alive:
+            self._parked = park(self._servo, self._parking, self._hurry)
+        self._servo.stop("the HAL process is ending")
+        pause = Event()
+        waited_s = 0.0
+        while self._ticking.alive and self._servo.status().mode is not ServoMode.STOPPED and waited_s < _BRAKING_S:
+            pause.wait(_LOOK_S)
+            waited_s += _LOOK_S
+
+    def soften(self) -> None:
+        """Let the motors of a parked arm go, if that is wanted; for when nothing ticks any more."""
+        if self._parked and self._parking is not None and self._parking.soften is not None:
+            self._parking.soften()
+            _LOG.info("the motors are soft")

@@ -9,6 +9,7 @@ from typing import Any
 from hal.arm import Arm
 from hal.camera import Camera
 from hal.clock import Clock
+from hal.parking import Parking
 from hal.registry import Registry
 
 
@@ -22,6 +23,10 @@ class Rig:
     call_every_tick: Callable[[Callable[[], None]], None] | None = None
     """In lock-step: registers what the clock calls every control period while somebody sleeps on it. None when the
     clock is the wall's, where `hal.servo_thread.ServoThread` does the calling."""
+    independent: bool = False
+    """Arm and camera are devices of their own, which can be connected at the same time."""
+    park: Parking | None = None
+    """What a HAL process does with the arm when it is told to end; None = the arm holds where it is."""
     world: Any = None
     """The simulated world behind the devices, for evaluation only; None on a real robot."""
 

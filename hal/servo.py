@@ -12,13 +12,13 @@ from hal.arm import Arm
 from hal.clock import Clock
 from hal.errors import CommandRefusedError, HalError, HalTimeoutError, NotConnectedError
 from hal.guard import Guard
-from hal.limits import OverloadWatch, ServoLimits, clip_setpoint, find_blocked
-from hal.messages import ArmSetpoint, ArmState, ServoMode, ServoStatus, TrajectoryChunk
+from hal.limits import OverloadWatch, ServoLimits, clip_setpoint, find_blocked, servo_torque
+from hal.messages import ArmSetpoint, ArmState, ServoHealth, ServoMode, ServoStatus, TrajectoryChunk
 from hal.motion import Motion, Wish
 from hal.orders import Orders, Snapshot
 from hal.periods import PeriodStatistics
 from hal.playback import Playback
-from hal.servo_status import Teller, make_status
+from hal.servo_status import Teller, make_health, make_status
 from hal.z1 import N_ARM
 
 _STATE_MAX_AGE_S = 0.2
@@ -54,6 +54,8 @@ class Servo:
         self.clock = clock
         self.limits = limits or ServoLimits()
         self.periods = PeriodStatistics()
+        self.real_time: tuple[str, ...] = ()
+        """What the thread that ticks was granted, for `health`."""
         self._heartbeat_timeout_s = heartbeat_timeout_s
         self._send_timeout_s = send_timeout_s
         self._guard = guard
@@ -146,7 +148,7 @@ class Servo:
 
     def fail(self, reason: str) -> None:
         """Latch and stop the arm itself: for a driver whose tick cannot go on."""
-        self.stop(reason)
+        self._orders.stop(reason)
         snapshot = self._snapshot
         if snapshot is not None:
             self._snapshot = snapshot._replace(mode=ServoMode.STOPPED, reason=reason)
@@ -196,6 +198,10 @@ class Servo:
         self._teller.tell(self._orders.latch, self._clips + self._orders.beyond, now_s)
         return make_status(snapshot, self._orders, self.periods, now_s)
 
+    def health(self) -> ServoHealth:
+        """Return how well the servo does its work."""
+        return make_health(self._connected(), self._orders, self.periods, self.real_time, self.clock.now_s())
+
     # --- The tick -----------------------------------------------------------------------------------------------
 
     def tick(self) -> None:
@@ -225,7 +231,7 @@ class Servo:
         if state.faults:
             self._fault(f"the arm reports {', '.join(state.faults)}")
             return
-        overload = self._overload.update(state.tau)
+        overload = self._overload.update(state.tau, servo_torque(self._q_sent, state.q))
         blocked = overload or find_blocked(self.limits, self._q_sent, state.q)
         if blocked:
             # Holding the command would go on pushing: once at rest, the arm holds what it measures instead. Only
@@ -254,13 +260,13 @@ class Servo:
             orders.finish(newest)
             orders.target = None
             if motion.mode is ServoMode.TRACKING:
-                motion.brake(orders.latch)
+                motion.brake(orders.latch, newest)
         elif current is not None:
             return self._follow(current, now_s)
         elif target is not None and now_s - target.stamp_s <= self._send_timeout_s:
             return self._chase(target.setpoint.q)
         elif motion.mode is ServoMode.TRACKING:
-            motion.brake("" if target else orders.cancel_reason)
+            motion.brake("" if target else orders.cancel_reason, newest)
             orders.target = None
         if self._give_way and motion.mode is ServoMode.HOLDING:
             self._give_way = False
@@ -271,10 +277,11 @@ class Servo:
         motion = self._motion
         if current.trajectory_id != motion.trajectory_id:
             motion.begin(current)
-        late = self._lateness(now_s)
-        if late or motion.runs_dry(current):
-            self._orders.finish(current)
-            motion.brake(late or f"trajectory {current.trajectory_id} ran dry at {current.end_s:.3f} s")
+        orders = self._orders
+        why = self._lateness(now_s) or orders.dead_end.get(current.trajectory_id, "")
+        if why or motion.runs_dry(current):
+            orders.finish(current)
+            motion.brake(why or f"trajectory {current.trajectory_id} ran dry at {current.end_s:.3f} s", current)
             return motion.rest()
         wish = motion.play(current)
         if motion.finished:

@@ -6,7 +6,7 @@ import logging
 
 import numpy as np
 
-from hal.messages import ServoStatus
+from hal.messages import ServoHealth, ServoStatus
 from hal.orders import Orders, Snapshot
 from hal.periods import PeriodStatistics
 
@@ -17,7 +17,7 @@ _WARN_EVERY_S = 1.0
 
 def make_status(snapshot: Snapshot, orders: Orders, periods: PeriodStatistics, now_s: float) -> ServoStatus:
     """Return the status that the last tick's `snapshot`, the `orders` and the measured `periods` amount to."""
-    p50, p999 = periods.summary_ms()
+    summary = periods.summary()
     current = orders.current
     buffered_s = 0.0
     if current is not None:
@@ -35,8 +35,31 @@ def make_status(snapshot: Snapshot, orders: Orders, periods: PeriodStatistics, n
         q_command=snapshot.q_sent,
         ticks=periods.ticks,
         overruns=periods.overruns,
-        period_ms_p50=p50,
-        period_ms_p999=p999,
+        period_ms_p50=summary.p50_ms,
+        period_ms_p999=summary.p999_ms,
+    )
+
+
+def make_health(
+    snapshot: Snapshot, orders: Orders, periods: PeriodStatistics, real_time: tuple[str, ...], now_s: float
+) -> ServoHealth:
+    """Return the health that the same amount to, of a thread that was granted `real_time`."""
+    summary = periods.summary()
+    owner = orders.lease.holder(now_s, at_rest=snapshot.at_rest)
+    return ServoHealth(
+        stamp_s=now_s,
+        mode=snapshot.mode,
+        faults=(orders.latch,) if orders.latch else snapshot.state.faults,
+        rate_hz=summary.rate_hz,
+        period_ms_p50=summary.p50_ms,
+        period_ms_p99=summary.p99_ms,
+        period_ms_p999=summary.p999_ms,
+        period_ms_max=summary.max_ms,
+        ticks=periods.ticks,
+        overruns=periods.overruns,
+        owner=owner,
+        command_age_s=max(now_s - orders.lease.beat_s, 0.0) if owner else 0.0,
+        real_time=real_time,
     )
 
 

@@ -13,6 +13,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
 from hal.clock import Clock
+from hal.messages import ServoMode
 from hal.z1 import CONTROL_PERIOD_S
 
 if TYPE_CHECKING:
@@ -84,7 +85,7 @@ class ServoThread:
 
     def _run(self) -> None:
         try:
-            _prepare(self._cpu)
+            self._servo.real_time = _prepare(self._cpu)
             self._servo.periods.measure(True)
             self._tick_for_ever()
         except Exception as error:  # every kind: a servo that dies must say so and leave the arm stopped
@@ -93,6 +94,7 @@ class ServoThread:
             self._servo.fail(f"the servo's tick failed: {type(error).__name__}: {error}")
         finally:
             gc.unfreeze()
+            gc.enable()
 
     def _tick_for_ever(self) -> None:
         clock, tick, ended = self._clock, self._servo.tick, self._end.is_set
@@ -106,26 +108,35 @@ class ServoThread:
             deadline_s += CONTROL_PERIOD_S
 
 
-def _prepare(cpu: int | None) -> None:
-    """Ask for what makes the calling thread punctual; go on without what is not permitted."""
-    granted = []
+def _prepare(cpu: int | None) -> tuple[str, ...]:
+    """Ask for what makes the calling thread punctual, go on without what is not permitted; return what was granted."""
+    granted, refused = [], []
     sys.setswitchinterval(_SWITCH_INTERVAL_S)
-    # What exists by now is no garbage while the servo runs; not looking at it keeps collections short.
-    gc.freeze()
+    # A collection holds up every thread: from now on somebody calls `collect_garbage`, who knows that the arm rests.
+    gc.disable()
+    gc.freeze()  # what exists by now is no garbage while the servo runs; not looking at it keeps those short
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_FIFO_PRIORITY))
         granted.append("SCHED_FIFO")
     except OSError:
-        pass
+        refused.append("SCHED_FIFO")
     if cpu is not None:
         try:
             os.sched_setaffinity(0, {cpu})
             granted.append(f"core {cpu}")
         except OSError:
-            pass
-    if _lock_memory():
-        granted.append("locked memory")
-    log.info("servo thread: real-time rights granted: %s (see `./z1 doctor`)", ", ".join(granted) or "none")
+            refused.append(f"core {cpu}")
+    (granted if _lock_memory() else refused).append("locked memory")
+    log.info("servo thread: granted %s", ", ".join(granted) or "nothing")
+    if refused:
+        log.warning("servo thread: not granted %s; expect late ticks, and see `./z1 doctor`", ", ".join(refused))
+    return tuple(granted)
+
+
+def collect_garbage(servo: Servo) -> None:
+    """Do what Python's collector may not do by itself while a servo ticks, if its arm is at rest."""
+    if servo.status().mode in (ServoMode.HOLDING, ServoMode.STOPPED):
+        gc.collect()
 
 
 def _lock_memory() -> bool:

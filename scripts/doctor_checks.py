@@ -124,9 +124,9 @@ def check_bus_port() -> Check:
     check = _check_port(
         "Zenoh port", config.port, f"end the program that holds it, or: ./z1 demo --port {config.port + 1}"
     )
-    if check.state is State.OK or not (robot := _our_hal(config)):
+    if check.state is State.OK or not (health := _our_hal(config)):
         return check
-    seen = f"{config.port} is held by our own HAL process (robot {robot!r})"
+    seen = f"{config.port} is held by our own HAL process (robot {config.robot!r}): {health}"
     return Check(
         "Zenoh port",
         State.WARN,
@@ -136,16 +136,15 @@ def check_bus_port() -> Check:
 
 
 def _our_hal(config: BusConfig) -> str:
-    """Return the robot's name if a HAL process of ours answers on that port, else nothing."""
-    from hal.bus.link import Link
+    """Return how a HAL process of ours does that answers on that port, else nothing."""
+    from hal.bus.health import describe_health, wait_for_health
     from hal.clock import WallClock
     from hal.errors import HalError
 
     try:
-        Link(config, WallClock(), "the doctor").close()
+        return describe_health(wait_for_health(config, WallClock()))
     except HalError:
         return ""
-    return config.robot
 
 
 def check_viewer_port() -> Check:

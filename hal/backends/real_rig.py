@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
+from hal.backends.z1_arm import Z1Arm
 from hal.backends.z1_config import Z1ArmConfig
 from hal.clock import WallClock
-from hal.registry import ARMS, CAMERAS
+from hal.parking import Parking
+from hal.registry import CAMERAS
 from hal.rig import Rig
+from hal.wire.controller import LABELS
 
 
 def make_rig(*, arm: Z1ArmConfig | None = None, camera: Any = None, **_: Any) -> Rig:
@@ -19,8 +22,11 @@ def make_rig(*, arm: Z1ArmConfig | None = None, camera: Any = None, **_: Any) ->
         **_: options of other rigs.
     """
     clock = WallClock()
+    z1_arm = Z1Arm(clock, arm)
     return Rig(
-        arm=ARMS.make("z1", clock=clock, config=arm),
+        arm=z1_arm,
         camera=CAMERAS.make("d405", clock=clock, config=camera),
         clock=clock,
+        independent=True,
+        park=Parking(q=LABELS["startFlat"], soften=z1_arm.go_passive),
     )

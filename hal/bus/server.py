@@ -3,6 +3,7 @@
 What goes which way, and why:
 
 * State and status: put at 100 Hz, REAL_TIME, DROP, express. The newest replaces the one before.
+* Health: put once a second.
 * Heartbeat: the same, from the owner. Losing one is harmless, five in a row make the servo brake.
 * Trajectory chunks: acked queries, not puts. A lost chunk would be noticed only by the arm running dry, and a refused
   one not at all; an answer costs about 1 ms every 0.1 s.
@@ -30,11 +31,12 @@ from hal.bus.session import BusConfig, open_session
 from hal.camera import Camera
 from hal.clock import Clock
 from hal.errors import HalError, InvalidMessageError, LeaseError
-from hal.messages import ArmSetpoint, TrajectoryChunk
+from hal.messages import ArmSetpoint, ServoHealth, TrajectoryChunk
 
 _LOG = logging.getLogger(__name__)
 _FRAME_TIMEOUT_S = 1.0
 _IDLE_S = 0.2
+_HEALTH_PERIOD_S = 1.0
 _HEARTBEATS_WAITING = 16
 
 
@@ -50,6 +52,8 @@ class OwnedServo(ServoedArm, Protocol):
     def send(self, setpoint: ArmSetpoint, owner: str | None = None) -> ArmSetpoint: ...
 
     def stop(self, reason: str = ...) -> None: ...
+
+    def health(self) -> ServoHealth: ...
 
 
 class HalServer:
@@ -119,6 +123,7 @@ class HalServer:
         }
         self._state = session.declare_publisher(keys.STATE, **urgent)
         self._status = session.declare_publisher(keys.STATUS, **urgent)
+        self._health = session.declare_publisher(keys.HEALTH)
         self._frames = session.declare_publisher(
             keys.FRAME, priority=zenoh.Priority.DATA_LOW, congestion_control=zenoh.CongestionControl.DROP
         )
@@ -132,6 +137,7 @@ class HalServer:
         )
         loops: dict[str, Callable[[], None]] = {
             "bus state": self._publish_state,
+            "bus health": self._publish_health,
             "bus frames": self._publish_frames,
         }
         for name, loop in loops.items():
@@ -154,6 +160,10 @@ class HalServer:
             # Late cycles move the following ones: nothing is sent twice to catch up.
             due_s = max(due_s + period_s, self._clock.now_s())
             self._clock.sleep_until(due_s)
+
+    def _publish_health(self) -> None:
+        while not self._closing.wait(_HEALTH_PERIOD_S):
+            self._health.put(encode(self._servo.health()))
 
     def _watched(self) -> Iterator[None]:
         """Yield again and again while somebody listens to frames; wait while nobody does; end at `close()`."""

@@ -94,7 +94,7 @@ def nobody_answers(config: BusConfig) -> HalTimeoutError:
     """Return the error for a link with nobody at the other end."""
     return HalTimeoutError(
         f"no HAL process answers at {config.endpoint} for robot {config.robot!r}; "
-        f"start it with `./z1 hal --hal sim`, or check `--port` and the robot's name."
+        f"start it with `./z1 hal --sim`, or check `--port` and the robot's name."
     )
 
 

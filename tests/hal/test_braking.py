@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from servo_bench import START, Bench
 
-from hal.braking import Blend, Brake, Chaser
+from hal.braking import Blend, Brake, Chaser, plan_path_stop
 from hal.limits import ServoLimits
+from hal.messages import TrajectoryChunk
+from hal.playback import Playback
 from hal.z1 import CONTROL_PERIOD_S, DDQ_MAX, DQ_MAX, N_JOINTS, Q_MAX, Q_MIN
 
 LIMITS = ServoLimits()
@@ -57,3 +60,62 @@ def test_a_chase_arrives_at_the_limit_when_its_target_lies_beyond() -> None:
         assert (np.abs(ddq) <= DDQ_MAX + 1e-9).all()
     assert q == pytest.approx(Q_MAX)
     assert dq == pytest.approx(ZERO, abs=1e-6)
+
+
+# --- On the path ----------------------------------------------------------------------------------------------------
+
+
+def circle(duration_s: float, speed: float = 1.0) -> Playback:
+    """Joints 1 and 2 go round a circle of 0.3 rad: no straight line, which every way of braking would stay on."""
+    t_s = np.arange(0.0, duration_s + 1e-9, 0.02)
+    q, dq = np.zeros((len(t_s), N_JOINTS)), np.zeros((len(t_s), N_JOINTS))
+    turn = speed / 0.3
+    q[:, 0], q[:, 1] = 0.3 * np.cos(turn * t_s), 0.3 * np.sin(turn * t_s)
+    dq[:, 0], dq[:, 1] = -speed * np.sin(turn * t_s), speed * np.cos(turn * t_s)
+    return Playback(1, t_s.tolist(), q, dq, False)
+
+
+@pytest.mark.parametrize("speed", [0.05, 0.5, 1.0])
+def test_a_stop_on_the_path_stays_on_it_and_begins_and_ends_without_a_jump(speed: float) -> None:
+    path = circle(1.0, speed)
+    stop = plan_path_stop(path, 0.5, LIMITS)
+    assert stop is not None
+    t_s = np.arange(0.0, stop.duration_s + 0.01, CONTROL_PERIOD_S)
+    q, dq = (np.array(x) for x in zip(*(stop.at(t) for t in t_s), strict=True))
+    assert np.hypot(q[:, 0], q[:, 1]) == pytest.approx(np.full(len(q), 0.3), abs=1e-5)
+    assert q[0] == pytest.approx(path.at(0.5)[0])
+    assert dq[0] == pytest.approx(path.at(0.5)[1])
+    assert not dq[-1].any()
+    assert np.diff(q, axis=0) / CONTROL_PERIOD_S == pytest.approx((dq[1:] + dq[:-1]) / 2, abs=2e-3)
+    assert stop.duration_s <= LIMITS.brake_s
+
+
+def test_too_short_a_path_is_no_path_to_stop_on() -> None:
+    path = circle(1.0)
+    assert plan_path_stop(path, 0.99, LIMITS) is None
+    assert plan_path_stop(path, 0.80, LIMITS) is not None
+
+
+def test_a_stopped_arm_stays_on_its_path_if_it_bends() -> None:
+    """The same path, played by the servo: home on the circle, then the stop."""
+    start = START.copy()
+    path = circle(1.5, 0.6)
+    shift = start - path.q[0]
+    ramp = np.array(path.t_s) / 1.5
+    ease = ramp**2 * (2.0 - ramp)  # from rest: the circle is gone round ever faster
+    pieces = [path.at(1.5 * s) for s in ease]
+    rate = ramp * (4.0 - 3.0 * ramp)
+    chunk = TrajectoryChunk(
+        trajectory_id=1,
+        t_s=np.array(path.t_s),
+        q=np.array([q for q, _ in pieces]) + shift,
+        dq=np.array([r * dq for r, (_, dq) in zip(rate, pieces, strict=True)]),
+    )
+    bench = Bench()
+    bench.servo.stream(chunk)
+    bench.run(1.1)
+    bench.servo.stop("the button")
+    bench.run_until_at_rest()
+    q = bench.commanded() - shift
+    assert np.hypot(q[:, 0], q[:, 1]) == pytest.approx(np.full(len(q), 0.3), abs=1e-4)
+    assert np.abs(np.diff(q, n=2, axis=0)).max() / CONTROL_PERIOD_S**2 < 1.5 * DDQ_MAX.max()

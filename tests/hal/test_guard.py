@@ -133,8 +133,18 @@ def test_a_later_chunk_through_the_table_is_refused_and_the_arm_brakes_before_it
     assert refused
     bench.run(1.0)
     assert bench.mode is ServoMode.HOLDING
-    # The part of the way that was allowed ends before the table; what is left is the way that braking takes.
-    assert guard.margins(bench.commanded()).table_m.min() > -0.03
+    assert "below the table's plane" in bench.reason
+    # It brakes on the part of the way that was allowed, which ends before the table.
+    assert guard.margins(bench.commanded()).table_m.min() > 0.0
+    assert off_the_way(bench.commanded(), whole) < 1e-5
+
+
+def off_the_way(q: np.ndarray, way: TrajectoryChunk) -> float:
+    """How far the postures `q` (N, 7) are from the straight line in joint space that `way` follows [rad]."""
+    along = way.q[-1] - way.q[0]
+    along /= np.linalg.norm(along)
+    off = q - way.q[0]
+    return float(np.abs(off - np.outer(off @ along, along)).max())
 
 
 def test_a_setpoint_below_the_table_is_refused(guard: Guard) -> None:

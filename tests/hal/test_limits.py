@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hal.errors import InvalidMessageError
-from hal.limits import OverloadWatch, ServoLimits, clip_setpoint, find_blocked
+from hal.limits import OverloadWatch, ServoLimits, clip_setpoint, find_blocked, servo_torque
 from hal.z1 import CONTROL_PERIOD_S, DQ_MAX, KP, N_ARM, N_JOINTS, Q_MAX, Q_MIN
 
 LIMITS = ServoLimits()
@@ -73,8 +73,25 @@ def test_a_motor_may_be_at_its_limit_for_a_tenth_of_a_second() -> None:
     watch = OverloadWatch(LIMITS)
     tau = ZERO.copy()
     tau[2] = -30.0
-    assert [watch.update(tau) for _ in range(50)] == [""] * 50
-    assert watch.update(tau).startswith("joint3 has been at its torque limit (-30.0 Nm)")
+    assert [watch.update(tau, ZERO) for _ in range(50)] == [""] * 50
+    assert watch.update(tau, ZERO).startswith("joint3 has been at its torque limit (-30.0 Nm of 29.4) for")
+
+
+def test_a_command_may_ask_for_more_than_a_motor_has_for_a_tenth_of_a_second() -> None:
+    watch = OverloadWatch(LIMITS)
+    command = MIDDLE.copy()
+    command[0] += 0.048
+    asked = servo_torque(command, MIDDLE)
+    assert asked[0] == pytest.approx(0.048 * 640)
+    assert [watch.update(ZERO, asked) for _ in range(50)] == [""] * 50
+    assert "joint1 does not follow: its command has asked for 30.7 Nm (allowed 30.0)" in watch.update(ZERO, asked)
+
+
+def test_a_gripper_may_be_asked_for_all_it_has() -> None:
+    watch = OverloadWatch(LIMITS)
+    asked = ZERO.copy()
+    asked[N_ARM] = 60.0
+    assert [watch.update(asked, asked) for _ in range(100)] == [""] * 100
 
 
 def test_short_peaks_of_different_motors_do_not_add_up() -> None:
@@ -82,7 +99,7 @@ def test_short_peaks_of_different_motors_do_not_add_up() -> None:
     for tick in range(300):
         tau = ZERO.copy()
         tau[tick // 40 % 2] = 60.0
-        assert watch.update(tau) == ""
+        assert watch.update(tau, ZERO) == ""
 
 
 @pytest.mark.parametrize("options", [{"grip_torque_nm": -1.0}, {"q_min": Q_MAX}, {"dq_max": [1, 2]}])

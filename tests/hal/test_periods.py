@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import pytest
 
-from hal.periods import PeriodStatistics
+from hal.periods import PeriodStatistics, PeriodSummary
 
 
 def test_periods_are_summed_up_only_while_they_are_measured() -> None:
     periods = PeriodStatistics(capacity=1000)
     for i in range(10):
         periods.record(0.002 * i)
-    assert periods.summary_ms() == (0.0, 0.0)
+    assert periods.summary() == PeriodSummary()
     assert (periods.ticks, periods.overruns) == (10, 0)
 
 
@@ -23,7 +23,7 @@ def test_median_and_tail_are_those_of_the_last_periods_in_the_ring() -> None:
         periods.record(now_s)
         now_s += step_s
     periods.record(now_s)
-    assert periods.summary_ms() == pytest.approx((2.0, 2.0))
+    assert periods.summary() == pytest.approx((500.0, 2.0, 2.0, 2.0, 2.0))
 
 
 def test_a_cycle_more_than_half_a_period_late_is_an_overrun() -> None:
@@ -38,12 +38,13 @@ def test_a_summary_is_kept_for_a_while() -> None:
     periods.measure(True)
     for i in range(10):
         periods.record(0.002 * i)
-    first = periods.summary_ms()
+    first = periods.summary()
     periods.record(1.0)
-    assert periods.summary_ms() == first
+    assert periods.summary() == first
     for i in range(500):
         periods.record(1.0 + 0.003 * i)
-    assert periods.summary_ms()[0] == pytest.approx(3.0)
+    assert periods.summary().p50_ms == pytest.approx(3.0)
+    assert periods.summary().max_ms == pytest.approx(982.0)
 
 
 def test_the_time_between_two_threads_that_tick_is_no_period() -> None:
@@ -54,4 +55,4 @@ def test_the_time_between_two_threads_that_tick_is_no_period() -> None:
             periods.record(start_s + 0.002 * i)
         periods.measure(False)
     assert periods.overruns == 0
-    assert periods.summary_ms() == pytest.approx((2.0, 2.0))
+    assert periods.summary() == pytest.approx((500.0, 2.0, 2.0, 2.0, 2.0))

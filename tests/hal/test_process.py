@@ -9,14 +9,17 @@ from contextlib import ExitStack
 from dataclasses import replace
 from threading import Event
 
+import numpy as np
 import pytest
 
 from hal.backends.mock_arm import MockArm, make_rig
 from hal.bus import keys
+from hal.bus.client import RemoteArm
 from hal.bus.service import Listener
 from hal.bus.session import BusConfig, open_session
 from hal.clock import WallClock
-from hal.errors import CameraError, HalError, NotConnectedError
+from hal.errors import CameraError, HalError, HalTimeoutError, NotConnectedError
+from hal.parking import Parking
 from hal.process import serve
 
 SIGNALLED = """
@@ -27,6 +30,17 @@ stop_on_signals(ended)
 with ended._cond:  # as the main thread does for a moment at each look at the event
     signal.raise_signal(signal.SIGTERM)
 print(ended.wait(30), flush=True)
+"""
+
+TWICE = """
+import signal, threading
+from hal.process import stop_on_signals
+first, second = threading.Event(), threading.Event()
+stop_on_signals(first, second)
+signal.raise_signal(signal.SIGINT)
+print(first.wait(30), second.is_set(), flush=True)
+signal.raise_signal(signal.SIGINT)
+print(first.wait(30), second.wait(30), flush=True)
 """
 
 
@@ -85,8 +99,11 @@ def test_a_thread_of_the_server_that_dies_ends_the_process(monkeypatch: pytest.M
             serve(rig, config, Event(), on_ready=listen)
 
 
-def test_a_camera_that_cannot_be_had_leaves_no_arm_connected(monkeypatch: pytest.MonkeyPatch) -> None:
-    rig = make_rig()
+@pytest.mark.parametrize("independent", [True, False])
+def test_a_camera_that_cannot_be_had_leaves_no_arm_connected(
+    monkeypatch: pytest.MonkeyPatch, independent: bool
+) -> None:
+    rig = replace(make_rig(), independent=independent)
 
     def fail() -> None:
         raise CameraError("no camera is plugged in")
@@ -96,6 +113,65 @@ def test_a_camera_that_cannot_be_had_leaves_no_arm_connected(monkeypatch: pytest
         serve(rig, free_config(), Event())
     with pytest.raises(NotConnectedError):
         rig.arm.read_state()
+
+
+def test_without_arm_and_camera_both_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    rig = replace(make_rig(), independent=True)
+
+    def no_camera() -> None:
+        raise HalTimeoutError("no camera at USB.")
+
+    def no_arm() -> None:
+        raise HalTimeoutError("no arm at 192.0.2.1.")
+
+    monkeypatch.setattr(rig.camera, "connect", no_camera)
+    monkeypatch.setattr(rig.arm, "connect", no_arm)
+    with pytest.raises(HalError, match=r"arm: no arm at 192\.0\.2\.1\. camera: no camera at USB\."):
+        serve(rig, free_config(), Event())
+
+
+@pytest.mark.parametrize("independent", [True, False])
+def test_an_arm_that_cannot_be_had_leaves_no_camera_connected(
+    monkeypatch: pytest.MonkeyPatch, independent: bool
+) -> None:
+    rig = replace(make_rig(), independent=independent)
+
+    def no_arm() -> None:
+        raise HalTimeoutError("no arm at 192.0.2.1.")
+
+    monkeypatch.setattr(rig.arm, "connect", no_arm)
+    with pytest.raises(HalTimeoutError, match="no arm"):
+        serve(rig, free_config(), Event())
+    with pytest.raises(NotConnectedError):
+        rig.camera.wait_for_frame(0.1)
+
+
+def test_a_rig_that_is_parked_goes_soft_when_nothing_ticks_any_more_and_before_it_is_let_go() -> None:
+    rig, end = make_rig(), Event()
+    folded = np.append(np.zeros(5), 1.0)
+    softened: list[np.ndarray] = []
+    parking = Parking(q=folded, speed_rad_s=3.0, soften=lambda: softened.append(rig.arm.read_state().q))
+    serve(replace(rig, park=parking), free_config(), end, on_ready=end.set)
+    assert softened[0][:6] == pytest.approx(folded, abs=1e-2)
+
+
+def test_an_arm_that_was_stopped_is_neither_parked_nor_softened() -> None:
+    rig, end, config = make_rig(), Event(), free_config()
+    softened: list[bool] = []
+
+    def stop() -> None:
+        with RemoteArm(config) as arm:
+            arm.stop("the button")
+        end.set()
+
+    parking = Parking(q=np.zeros(6), speed_rad_s=3.0, soften=lambda: softened.append(True))
+    serve(replace(rig, park=parking), config, end, on_ready=stop)
+    assert softened == []
+
+
+def test_a_second_signal_is_told_apart_from_the_first() -> None:
+    done = subprocess.run([sys.executable, "-c", TWICE], capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout == "True False\nTrue True\n"
 
 
 def test_a_lock_step_rig_is_refused() -> None:

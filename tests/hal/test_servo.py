@@ -10,8 +10,9 @@ from servo_bench import ARM, RAMP_S, START, STEP, Bench, cruise, move, setpoint
 
 from hal.arm import ServoedArm
 from hal.errors import CommandRefusedError, HalTimeoutError, LeaseError, StoppedError
+from hal.limits import ServoLimits
 from hal.messages import ServoMode, TrajectoryChunk
-from hal.z1 import CONTROL_PERIOD_S, DDQ_MAX, DQ_MAX, KP, N_ARM, N_JOINTS, Q_MAX, Q_MIN
+from hal.z1 import CONTROL_PERIOD_S, DDQ_MAX, DQ_MAX, KP, N_ARM, N_JOINTS, Q_MAX, Q_MIN, TAU_MAX
 
 HOLDING, TRACKING, BRAKING, STOPPED = ServoMode.HOLDING, ServoMode.TRACKING, ServoMode.BRAKING, ServoMode.STOPPED
 
@@ -403,7 +404,18 @@ def test_lost_commands_are_noticed_as_a_joint_that_does_not_follow() -> None:
     bench.servo.stream(move())
     bench.run(1.5)
     assert bench.mode is STOPPED
-    assert "from its command" in bench.reason
+    assert "joint1 does not follow: its command has asked for" in bench.reason
+    asked = KP[0] * (bench.servo.status().q_command - bench.arm.read_state().q)[0]
+    assert abs(asked) < TAU_MAX[0], "at rest the command has given way"
+
+
+def test_a_joint_far_from_its_command_latches_at_once() -> None:
+    bench = Bench(limits=ServoLimits(tau_max=np.full(N_JOINTS, 1e4)))
+    bench.arm.drop_commands = True
+    bench.servo.stream(move())
+    bench.run(1.5)
+    assert bench.mode is STOPPED
+    assert "from its command (allowed 0.30)" in bench.reason
 
 
 def test_a_motor_at_its_torque_limit_for_long_latches() -> None:

@@ -94,6 +94,8 @@ def test_port_taken_by_our_own_hal_is_a_warning(monkeypatch: pytest.MonkeyPatch)
     servo.disconnect()
     assert row.state is State.WARN
     assert "our own HAL process" in row.seen
+    assert "servo holding at 0.0 Hz" in row.seen
+    assert "nobody commands" in row.seen
     assert "./z1 run" in row.fix
 
 

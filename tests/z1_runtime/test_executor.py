@@ -72,7 +72,7 @@ def test_no_more_than_the_lead_waits_at_the_servo(bench, executor):
 
 
 def test_a_stop_in_mid_motion_is_told_and_leaves_the_arm_at_rest(bench, executor):
-    bench.at_time(0.5, lambda: bench.servo.stop("red button"))
+    bench.at_time(0.4, lambda: bench.servo.stop("red button"))
     with pytest.raises((MotionError, StoppedError), match="red button"):
         executor.execute(MOVE)
     assert rests_where_it_is(bench)
@@ -93,7 +93,7 @@ def test_nothing_moves_while_the_stop_is_latched_and_all_is_well_after_rearming(
 
 
 def test_a_fault_of_the_arm_in_mid_motion_is_told(bench, executor):
-    bench.at_time(0.5, lambda: bench.mock.inject_fault("overheat joint 2"))
+    bench.at_time(0.4, lambda: bench.mock.inject_fault("overheat joint 2"))
     with pytest.raises((MotionError, StoppedError), match="overheat joint 2"):
         executor.execute(MOVE)
     assert rests_where_it_is(bench)

@@ -19,6 +19,7 @@ from hal.messages import (
     ArmState,
     Intrinsics,
     RgbdFrame,
+    ServoHealth,
     ServoMode,
     ServoStatus,
     TrajectoryChunk,
@@ -58,6 +59,21 @@ SAMPLES = [
         trajectory_id=4, t_s=np.arange(5) * 0.02, q=RNG.normal(size=(5, 7)), dq=RNG.normal(size=(5, 7)), final=True
     ),
     STATUS,
+    ServoHealth(
+        stamp_s=3.5,
+        mode=ServoMode.STOPPED,
+        faults=("hot",),
+        rate_hz=499.5,
+        period_ms_p50=2.0,
+        period_ms_p99=2.25,
+        period_ms_p999=2.5,
+        period_ms_max=30.0,
+        ticks=12345,
+        overruns=2,
+        owner="",
+        command_age_s=0.0,
+        real_time=("SCHED_FIFO",),
+    ),
     Hello(robot="z1", versions=("protocol=1",), now_s=2.5),
 ]
 ENCODED = [encode(sample) for sample in SAMPLES]

@@ -50,7 +50,7 @@ def test_a_port_in_use_is_named_with_what_to_do():
 @pytest.mark.parametrize("device", [RemoteArm, RemoteCamera])
 def test_a_client_with_nobody_there_is_told_how_to_start_one(device):
     config = free_config(connect_timeout_s=0.3)
-    with pytest.raises(HalTimeoutError, match=rf"{config.port}.*`./z1 hal --hal sim`"):
+    with pytest.raises(HalTimeoutError, match=rf"{config.port}.*`./z1 hal --sim`"):
         device(config).connect()
 
 

@@ -1,0 +1,46 @@
+"""How well a HAL process does its work, for whoever wants to know and commands nothing."""
+
+from __future__ import annotations
+
+import queue
+
+from hal.bus import keys
+from hal.bus.codec import decode
+from hal.bus.link import Link
+from hal.bus.service import Listener, as_bytes
+from hal.bus.session import BusConfig
+from hal.clock import Clock
+from hal.errors import HalTimeoutError
+from hal.messages import ServoHealth
+
+
+def wait_for_health(config: BusConfig, clock: Clock, timeout_s: float = 3.0) -> ServoHealth:
+    """Return the next health that the HAL process publishes, within about a second.
+
+    Raises:
+        HalTimeoutError: no HAL process answers, or it publishes none.
+        InvalidMessageError: what it publishes is none.
+    """
+    heard: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+    link = Link(config, clock, "the HAL's health")
+    listener = Listener(link.session, keys.HEALTH, lambda sample: heard.put(as_bytes(sample.payload)))
+    try:
+        return decode(heard.get(timeout=timeout_s), ServoHealth)
+    except queue.Empty as err:
+        raise HalTimeoutError(
+            f"the HAL process at {config.endpoint} published no health within {timeout_s:g} s; look at its log."
+        ) from err
+    finally:
+        listener.close()
+        link.close()
+
+
+def describe_health(health: ServoHealth) -> str:
+    """Return `health` in one line."""
+    command = f"{health.owner} heard {1e3 * health.command_age_s:.0f} ms ago" if health.owner else "nobody commands"
+    faults = f"; {'; '.join(health.faults)}" if health.faults else ""
+    return (
+        f"servo {health.mode.value} at {health.rate_hz:.1f} Hz, period p50 {health.period_ms_p50:.2f}, "
+        f"p99 {health.period_ms_p99:.2f}, max {health.period_ms_max:.1f} ms, {health.overruns} overruns in "
+        f"{health.ticks} ticks; real time: {', '.join(health.real_time) or 'nothing granted'}; {command}{faults}"
+    )

@@ -1,0 +1,44 @@
+"""A servo that only watches: it measures and tells, and commands nothing, whoever asks."""
+
+from __future__ import annotations
+
+from hal.errors import CommandRefusedError, LeaseError
+from hal.servo import Servo
+
+_WHY = "this HAL only watches (--readonly) and commands nothing"
+
+
+class ReadonlyServo(Servo):
+    """A servo whose ticks measure, publish, and no more. What the arm reports latches as usual, and is told."""
+
+    def claim(self, owner: str) -> None:
+        """Refuse.
+
+        Raises:
+            LeaseError: always.
+        """
+        raise LeaseError(f"{_WHY}; {owner!r} cannot have the arm. Start it again without --readonly to move it.")
+
+    def stop(self, reason: str = "stop requested") -> None:
+        """Refuse: whoever moves the arm, it is not this servo.
+
+        Raises:
+            CommandRefusedError: always.
+        """
+        raise CommandRefusedError(
+            f"{_WHY}, so it cannot stop the arm ({reason}): stop whoever moves it, or use the switch on the arm."
+        )
+
+    def tick(self) -> None:
+        """One cycle: measure and tell.
+
+        Raises:
+            NotConnectedError: before `connect()`.
+        """
+        self._connected()
+        self._ticked = True
+        now_s = self.clock.now_s()
+        self.periods.record(now_s)
+        self._measure()
+        self._q_sent = self._motion.q = self._state.q
+        self._publish(now_s)

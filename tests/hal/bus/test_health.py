@@ -1,0 +1,38 @@
+"""The health of a HAL process, as whoever commands nothing reads it."""
+
+from __future__ import annotations
+
+import pytest
+from conftest import free_config, wait_until
+
+from hal.bus.health import describe_health, wait_for_health
+from hal.clock import WallClock
+from hal.errors import HalTimeoutError
+from hal.messages import ServoMode
+
+
+def test_the_health_of_a_servo_is_what_its_thread_measured(hal, remote_arm):
+    remote_arm.claim()
+    wait_until(lambda: hal.servo.health().rate_hz > 0)
+    health = wait_for_health(hal.config, WallClock())
+    assert health.mode is ServoMode.HOLDING
+    assert health.owner.startswith("tester-")
+    assert 0.0 <= health.command_age_s < 1.0
+    assert 0.0 < health.period_ms_p50 <= health.period_ms_p99 <= health.period_ms_p999 <= health.period_ms_max
+    assert health.faults == ()
+    assert health.real_time == hal.servo.real_time
+    assert f"at {health.rate_hz:.1f} Hz" in describe_health(health)
+    assert "heard" in describe_health(health)
+
+
+def test_faults_are_told(hal):
+    hal.arm.inject_fault("overheat joint 2")
+    wait_until(lambda: hal.servo.status().mode is ServoMode.STOPPED)
+    health = wait_until(lambda: (h := wait_for_health(hal.config, WallClock())).mode is ServoMode.STOPPED and h)
+    assert health.faults == ("the arm reports overheat joint 2",)
+    assert describe_health(health).endswith("nobody commands; the arm reports overheat joint 2")
+
+
+def test_where_nobody_serves_that_is_said():
+    with pytest.raises(HalTimeoutError, match="no HAL process answers"):
+        wait_for_health(free_config(connect_timeout_s=0.2), WallClock())
