@@ -22,6 +22,8 @@ from hal.clock import Stopwatch
 from hal.errors import HalError
 from hal.messages import ServoStatus
 from scripts.hal_process import HalProcess
+from scripts.rig_word import RigWord
+from scripts.run_hal import TWINS
 from sim_twin.scene import SceneConfig
 
 if TYPE_CHECKING:  # planner and viewer take seconds to load: that happens beside the HAL's own start
@@ -37,8 +39,8 @@ LIFTED_M = 0.05
 class Config:
     """What stands where, and what is written."""
 
-    hal: Literal["sim", "wire-sim"] = "sim"
-    """How the twin is reached: in the HAL's process, or through the real arm's and the real camera's drivers."""
+    rig: Annotated[RigWord, tyro.conf.arg(name="")] = field(default_factory=RigWord)
+    """Which hardware; a demo is of the twin's."""
     object: str = "bottle"
     """bottle, box or cylinder."""
     pitch_deg: float = 0.0
@@ -79,8 +81,13 @@ class Config:
     """Where the two processes meet."""
 
     def __post_init__(self) -> None:
-        if self.lockstep and self.hal != "sim":
-            raise ValueError(f"--lockstep has no wire to go through; leave out --hal {self.hal}.")
+        if self.rig.name not in TWINS:
+            raise ValueError(
+                f"the demo knows where everything really is, so it is of the twin's: {' or '.join(TWINS)}, not "
+                f"{self.rig.name}. For other hardware: ./z1 hal --hal {self.rig.name}, and beside it ./z1 run."
+            )
+        if self.lockstep and self.rig.name != "sim":
+            raise ValueError(f"--lockstep has no wire to go through; leave out --{self.rig.name}.")
 
 
 def main(config: Config) -> int:
@@ -126,7 +133,7 @@ def main(config: Config) -> int:
 
 
 def _start_hal(config: Config, scene: SceneConfig, undo: ExitStack) -> HalProcess:
-    process = HalProcess(scene, config.bus, config.out / "hal.log", config.hal)
+    process = HalProcess(scene, config.bus, config.out / "hal.log", config.rig.name)
     undo.callback(process.end)
     return process
 

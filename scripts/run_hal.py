@@ -1,10 +1,12 @@
 """Serve an arm and a camera over Zenoh: servo at 500 Hz, limits, watchdog and stop.
 
-    ./z1 hal --hal sim --object bottle      the digital twin
-    ./z1 hal --hal wire-sim                 the twin behind the real arm's and the real camera's drivers
-    ./z1 hal --hal mock                     an arm without physics, for trying clients
+    ./z1 hal --sim --object bottle      the digital twin
+    ./z1 hal --wire-sim                 the twin behind the real arm's and the real camera's drivers
+    ./z1 hal --mock                     an arm without physics, for trying clients
+    ./z1 hal --real                     the Z1 and the D405
+    ./z1 hal --real --readonly          the same, watched only: nothing is commanded
 
-Stop it with Ctrl-C: it brakes, holds, and lets go.
+Stop it with Ctrl-C: it brakes, holds, and lets go; the real arm is folded first, and its motors go soft.
 """
 
 from __future__ import annotations
@@ -12,16 +14,18 @@ from __future__ import annotations
 import logging
 import os
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from threading import Event, Thread
 from typing import Annotated
 
 import tyro
 
+from hal.backends.z1_config import Z1ArmConfig, Z1Mode
 from hal.bus.session import BusConfig
 from hal.guard import Workspace
 from hal.process import serve, stop_on_signals
 from hal.rig import RIGS, Rig
+from scripts.rig_word import RigWord
 
 TWINS = ("sim", "wire-sim")
 """Rigs that are made of a scene."""
@@ -33,8 +37,12 @@ READY = "ready"
 class Config:
     """Which hardware, where, and for the twin what stands on the table."""
 
-    hal: str = "sim"
-    """Which rig: `sim` is the twin, `wire-sim` the same behind the real drivers, `mock` an arm without physics."""
+    rig: Annotated[RigWord, tyro.conf.arg(name="")] = field(default_factory=RigWord)
+    """Which hardware."""
+    arm: Z1ArmConfig = field(default_factory=Z1ArmConfig)
+    """Real: where the Z1's controller is, and how it is used."""
+    readonly: bool = False
+    """Publish what arm and camera measure, and refuse to command the arm."""
     object: str = "bottle"
     """Twin: what stands on the table: bottle, box or cylinder."""
     distance_m: float = 0.48
@@ -57,6 +65,8 @@ class Config:
     """Where the arm may be, whoever commands it."""
     bus: Annotated[BusConfig, tyro.conf.arg(name="")] = field(default_factory=BusConfig)
     """Where to listen."""
+    cpu: int | None = None
+    """Core for the servo's thread alone, best one kept free of others (`isolcpus`); by default any."""
     until_stdin_closes: bool = False
     """End when standard input closes: whoever started this process and dies takes it along, after braking."""
 
@@ -67,8 +77,8 @@ def main(config: Config) -> int:
     for room in ("hal", "sim_twin"):
         logging.getLogger(room).setLevel(logging.INFO)
     rig = make_rig(config)
-    stop_event = Event()
-    stop_on_signals(stop_event)
+    stop_event, hurry_event = Event(), Event()
+    stop_on_signals(stop_event, hurry_event)
     if config.until_stdin_closes:
         Thread(target=_watch_stdin, args=(stop_event,), daemon=True).start()
     with ExitStack() as undo:
@@ -80,7 +90,16 @@ def main(config: Config) -> int:
                 undo.callback(TruthServer(config.bus, rig.world).close)
             print(READY, flush=True)
 
-        serve(rig, config.bus, stop_event, on_ready=ready, workspace=config.workspace)
+        serve(
+            rig,
+            config.bus,
+            stop_event,
+            on_ready=ready,
+            workspace=config.workspace,
+            cpu=config.cpu,
+            hurry_event=hurry_event,
+            readonly=config.readonly,
+        )
     return 0
 
 
@@ -91,8 +110,10 @@ def make_rig(config: Config) -> Rig:
         UnknownBackendError: no such rig.
         ValueError: the scene is out of range.
     """
-    if config.hal not in TWINS:
-        return RIGS.make(config.hal)
+    name = config.rig.name
+    arm = replace(config.arm, mode=Z1Mode.OBSERVE) if config.readonly else config.arm
+    if name not in TWINS:
+        return RIGS.make(name, arm=arm)
     from calibration.board import Board
     from scripts.calibration_robot import RobotOptions, make_print
     from sim_twin.scene import SceneConfig
@@ -108,7 +129,7 @@ def make_rig(config: Config) -> Rig:
         mount_error_deg=config.mount_error_deg,
         mount_seed=config.mount_seed,
     )
-    return RIGS.make(config.hal, scene=scene)
+    return RIGS.make(name, scene=scene, **({"mode": arm.mode} if name == "wire-sim" else {}))
 
 
 def _watch_stdin(stop_event: Event) -> None:
