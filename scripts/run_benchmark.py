@@ -3,10 +3,14 @@
 ./z1 bench                                       # vanilla, mvb and full on all 81; some minutes on two cores
 ./z1 bench --methods full --objects box --seeds 0 1 2 --out out/boxes
 ./z1 bench --methods mvb mvb:k=3 mvb:alpha=0.5,box=upright --resume
+./z1 bench --methods full --physics-noise --clutter 0 2 --top-k 3
+./z1 bench --methods full --mesh drill.stl --scale 0.001 --mass 0.4
+./z1 bench --seeds 0 1 2 3 4 --ray auto          # on the Ray cluster that this machine is part of
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -17,8 +21,12 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 if TYPE_CHECKING:
+    from sim_twin.bench.pictures import Picture
+    from sim_twin.bench.rows import Row
     from sim_twin.bench.runner import Task
     from sim_twin.bench.store import Store
+    from sim_twin.parts import GraspObject
+    from z1_runtime.config import RuntimeConfig
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,33 +39,60 @@ class Config:
     """The paper's objects in 27 poses each, or the further ones, upright, in 9."""
     objects: tuple[str, ...] = ()
     """What stands on the table, if not all objects of the set."""
+    mesh: Path | None = None
+    """A mesh of yours (STL, OBJ, PLY, OFF, GLB; z up) instead of the set, in 27 poses; --objects adds others. It need
+    not be watertight, but walls without thickness come out filled. What cannot stand by itself is held as leaning
+    objects are."""
+    scale: float = 1.0
+    """Metres in one unit of --mesh: 0.001 for a file in millimetres."""
+    mass: float = 0.2
+    """Mass of --mesh [kg]."""
     occlusion: tuple[float, ...] = (0.0,)
     """Shares of the object hidden from the camera."""
+    clutter: tuple[int, ...] = (0,)
+    """Numbers of neighbours, 0 to 3, that stand around the object; it is told to the detector by its class, or by the
+    twin's truth where the detector knows no classes."""
+    physics_noise: bool = False
+    """Friction and mass are off by up to 30 %, the camera by 3 mm and 1°, and the arm is up to 20 ms late."""
     seeds: tuple[int, ...] = (0,)
     """Each seed runs all poses anew, with other noise and other candidates."""
+    top_k: int = 1
+    """Grasps that may be executed in an episode: after a failure the scene is looked at again, as it then is."""
     generator: str | None = None
     """Grasp generator; the configuration's if not given."""
     detector: str | None = None
-    """Detector; the configuration's if not given."""
+    """Detector; the configuration's if not given. One that knows classes is told each of the paper's objects' own."""
     config: Path | None = None
     """A YAML file of settings (see `./z1 show-config`)."""
     jobs: int = 2
     """Episodes side by side, a process each."""
+    ray: str | None = None
+    """Address of a Ray cluster to run on instead: `auto`, HOST:6379 or ray://HOST:10001 (the extra `ray`)."""
     resume: bool = False
     """Go on with an interrupted run in the same folder."""
-    pictures: Literal["failures", "all", "none"] = "none"
+    pictures: Literal["failures", "all", "none"] = "failures"
     """Final states to draw into pictures/: up to 12 failures, which the report shows too, or every episode's."""
-    recordings: Literal["failures", "all", "none"] = "none"
-    """Episodes to write into recordings/ for Rerun: what was seen, ranked and chosen; about 2 MB each."""
+    recordings: Literal["shown", "failures", "all", "none"] = "shown"
+    """Episodes to write into recordings/ for Rerun, at their first look: what was seen, ranked and chosen; about 2 MB
+    each. `shown`: those with a picture in the report."""
     out: Path = Path("out/bench")
-    """Folder for episodes/, episodes.parquet, summary.json and report.html."""
+    """Folder for episodes/, episodes.parquet, summary.json, report.html, pictures/ and recordings/."""
+
+    def __post_init__(self) -> None:
+        if self.jobs < 1:
+            raise ValueError(f"jobs is {self.jobs}; allowed is 1 or more.")
+        if not 1 <= self.top_k <= 10:
+            raise ValueError(f"top-k is {self.top_k}; allowed is 1 to 10.")
+        if self.ray is not None and self.recordings in ("failures", "all"):
+            raise ValueError(
+                f"--recordings {self.recordings} would leave files on the cluster's machines; with --ray allowed are "
+                "shown and none."
+            )
 
 
 def main(config: Config) -> int:
     """Run what is missing, and say how it went."""
     from sim_twin.bench.methods import parse_method
-    from sim_twin.bench.pictures import draw_pictures
-    from sim_twin.bench.recordings import Recordings
     from sim_twin.bench.report import write_report
     from sim_twin.bench.runner import make_tasks
     from sim_twin.bench.scenarios import OBJECT_SETS, grid
@@ -65,21 +100,23 @@ def main(config: Config) -> int:
     from sim_twin.bench.summary import write_summary
     from z1_runtime.config import load_config
 
-    if config.jobs < 1:
-        raise ValueError(f"jobs is {config.jobs}; allowed is 1 or more.")
     methods = [parse_method(text) for text in config.methods]
-    scenarios = grid(config.objects or OBJECT_SETS[config.set], config.seeds, config.occlusion)
+    shapes = _shapes(config)
+    objects = (*shapes, *config.objects) or OBJECT_SETS[config.set]
+    scenarios = grid(
+        objects, config.seeds, config.occlusion, config.clutter, physics_noise=config.physics_noise, shapes=shapes
+    )
     changes = {"generator": config.generator, "detector": config.detector}
     runtime = replace(load_config(config.config), **{key: value for key, value in changes.items() if value})
     store = Store(config.out, config.resume)
-    folder = config.out / "recordings"
-    recordings = None if config.recordings == "none" else Recordings(folder=folder, choice=config.recordings)
-    tasks = make_tasks(scenarios, methods, runtime, store.done(), recordings)
+    tasks = make_tasks(
+        scenarios, methods, runtime, store.done(), top_k=config.top_k, recordings=_recordings_of_all(config)
+    )
     console = Console(highlight=False)
     report = config.out / "report.html"
     rows, summary = [], {}
     try:
-        _run(tasks, config.jobs, store, console)
+        _run(tasks, config, store, console)
     finally:
         rows = store.rows()
         if rows:
@@ -88,20 +125,35 @@ def main(config: Config) -> int:
             summary = write_summary(rows, config.out / "summary.json", _plain(run))
             write_report(rows, summary, report)
             _print(console, summary)
-    pictures = draw_pictures(rows, config.pictures, config.out / "pictures")
-    if pictures:
+    if pictures := _pictures(rows, config, runtime, shapes):
         write_report(rows, summary, report, pictures)
     console.print(f"rows: {config.out}/episodes.parquet, figures: {config.out}/summary.json and report.html")
     return 0
 
 
-def _run(tasks: list[Task], jobs: int, store: Store, console: Console) -> None:
-    from sim_twin.bench.runner import run_tasks
+def _shapes(config: Config) -> dict[str, GraspObject]:
+    """Return the user's own object by its name."""
+    if config.mesh is None:
+        return {}
+    from sim_twin.mesh_objects import load_mesh_object
 
-    tally = {row["method"]: [0, 0] for row in store.rows(["method"])}
+    name, shape = load_mesh_object(config.mesh, config.scale, config.mass)
+    return {name: shape}
+
+
+def _recordings_of_all(config: Config):
+    """Return what is recorded while it is run."""
+    from sim_twin.bench.recordings import Recordings
+
+    if config.recordings not in ("failures", "all"):
+        return None
+    return Recordings(folder=config.out / "recordings", choice=config.recordings)
+
+
+def _run(tasks: list[Task], config: Config, store: Store, console: Console) -> None:
+    tally: dict[str, list[int]] = {}
     for row in store.rows(["method", "success"]):
-        tally[row["method"]][0] += row["success"]
-        tally[row["method"]][1] += 1
+        _count(tally, row)
     columns = (
         TextColumn("scenarios"),
         BarColumn(),
@@ -113,13 +165,45 @@ def _run(tasks: list[Task], jobs: int, store: Store, console: Console) -> None:
     )
     with Progress(*columns, console=console) as progress:
         bar = progress.add_task("", total=len(tasks))
-        for rows in run_tasks(tasks, jobs):
+        for rows in _rows_of(tasks, config):
             store.add(rows)
             for row in rows:
-                count = tally.setdefault(row["method"], [0, 0])
-                count[0] += row["success"]
-                count[1] += 1
+                _count(tally, row)
             progress.update(bar, advance=1, description="  ".join(f"{m} {s}/{n}" for m, (s, n) in tally.items()))
+
+
+def _rows_of(tasks: list[Task], config: Config) -> Iterator[list[Row]]:
+    from sim_twin.bench.cluster import run_tasks_on_ray
+    from sim_twin.bench.runner import run_tasks
+
+    if not tasks:
+        return iter(())
+    return run_tasks(tasks, config.jobs) if config.ray is None else run_tasks_on_ray(tasks, config.ray)
+
+
+def _count(tally: dict[str, list[int]], row: Row) -> None:
+    count = tally.setdefault(row["method"], [0, 0])
+    count[0] += row["success"]
+    count[1] += 1
+
+
+def _pictures(rows: list[Row], config: Config, runtime: RuntimeConfig, shapes: dict[str, GraspObject]) -> list[Picture]:
+    """Draw pictures, and make the recordings that go with them: episodes are the same whenever they are run."""
+    from sim_twin.bench.episode import record_scenario, recording_name
+    from sim_twin.bench.methods import parse_method
+    from sim_twin.bench.pictures import draw_pictures
+    from sim_twin.bench.runner import make_decider
+    from sim_twin.bench.scenarios import Scenario
+
+    folder, pictures = config.out / "recordings", []
+    for row, picture in draw_pictures(rows, config.pictures, config.out / "pictures", shapes):
+        scenario, method = Scenario.of(row, shapes), parse_method(row["method"])
+        path = folder / recording_name(scenario, method)
+        if config.recordings == "shown" and not path.exists():
+            record_scenario(scenario, method, lambda s, seed: make_decider(runtime, s, seed), folder)
+        link = path.relative_to(config.out).as_posix() if path.exists() else ""
+        pictures.append(replace(picture, recording=link))
+    return pictures
 
 
 def _print(console: Console, summary: dict[str, Any]) -> None:
@@ -136,6 +220,9 @@ def _print(console: Console, summary: dict[str, Any]) -> None:
             modes,
         )
     console.print(table)
+    for name, method in summary["methods"].items():
+        if len(after := method["rate_after"]) > 1:
+            console.print(f"{name}: " + ", ".join(f"{rate:.1%} within {k}" for k, rate in enumerate(after, 1)))
     for pair in summary["paired"]:
         first, second = pair["methods"]
         console.print(

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from itertools import chain, zip_longest
 from pathlib import Path
 from typing import Literal
@@ -14,6 +15,8 @@ from PIL import Image
 from sim_twin.bench.methods import file_name
 from sim_twin.bench.rows import Row
 from sim_twin.bench.scenarios import Scenario
+from sim_twin.objects import OBJECTS
+from sim_twin.parts import GraspObject
 from sim_twin.view import draw_picture
 
 Choice = Literal["failures", "all", "none"]
@@ -22,29 +25,45 @@ SHOWN = 12
 _SIZE, _SMALL = (960, 540), (480, 270)
 
 
-def draw_pictures(rows: Sequence[Row], choice: Choice, folder: Path) -> dict[str, bytes]:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Picture:
+    """What the report shows of one episode."""
+
+    words: str
+    """Said below it."""
+    jpeg: bytes
+    """A small JPEG file."""
+    recording: str = ""
+    """Its .rrd file, from the report's folder; empty where there is none."""
+
+
+def draw_pictures(
+    rows: Sequence[Row], choice: Choice, folder: Path, shapes: Mapping[str, GraspObject] | None = None
+) -> list[tuple[Row, Picture]]:
     """Draw the final state of episodes as <scenario>-<method>.png in `folder`.
 
     Args:
         rows: of any methods; an episode in which the arm never moved has no final state and no picture.
         choice: `failures` draws those that the report shows, `all` every episode.
         folder: is made.
+        shapes: the objects that are none of the named ones, by name; others than these cannot be drawn.
 
     Returns:
-        Small JPEG files of the chosen failures by what is to be said of each.
+        What the report shows, and the rows it is of.
     """
     if choice == "none":
-        return {}
+        return []
+    shapes = shapes or {}
+    rows = [row for row in rows if _can_be_drawn(row, shapes)]
     shown = choose_failures(rows)
     folder.mkdir(parents=True, exist_ok=True)
-    pictures: dict[str, bytes] = {}
+    pictures = []
     for row in rows if choice == "all" else shown:
-        if row.get("final_qpos") is None:
-            continue
-        png = draw_picture(Scenario.of(row).scene(), np.array(row["final_qpos"]), *_SIZE)
+        png = draw_picture(Scenario.of(row, shapes).scene(), np.array(row["final_qpos"]), *_SIZE)
         (folder / f"{row['scenario']}-{file_name(row['method'])}.png").write_bytes(png)
         if row in shown:
-            pictures[f"{row['scenario']}, {row['method']}: {row['mode']}"] = _small_jpeg(png)
+            words = f"{row['scenario']}, {row['method']}: {row['mode']}"
+            pictures.append((row, Picture(words=words, jpeg=_small_jpeg(png))))
     return pictures
 
 
@@ -56,6 +75,10 @@ def choose_failures(rows: Sequence[Row], most: int = SHOWN) -> list[Row]:
             kinds.setdefault((row["method"], row["mode"]), []).append(row)
     turns = chain.from_iterable(zip_longest(*kinds.values()))
     return [row for row in turns if row is not None][:most]
+
+
+def _can_be_drawn(row: Row, shapes: Mapping[str, GraspObject]) -> bool:
+    return row.get("final_qpos") is not None and (row["object"] in OBJECTS or row["object"] in shapes)
 
 
 def _small_jpeg(png: bytes) -> bytes:

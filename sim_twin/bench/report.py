@@ -8,53 +8,52 @@ from collections.abc import Callable, Mapping, Sequence
 from html import escape
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
-import numpy as np
-
-from sim_twin.bench import svg
+from sim_twin.bench import paper, svg
+from sim_twin.bench import report_tables as tables
 from sim_twin.bench.methods import METHODS
+from sim_twin.bench.pictures import Picture
 from sim_twin.bench.rows import Row
 from sim_twin.bench.scenarios import DISTANCES_M, LATERALS_M
-from sim_twin.bench.summary import STAGES
 
-PAPER_RATES = {"vanilla": 0.247, "mvb": 0.593}
-"""The paper's success rates, 81 episodes each; no other of its figures is given here."""
-_READINGS = {
-    "fallthrough": ("success", "the first candidate with IK, path and clearance is executed"),
-    "top1": ("success_top1", "only the first-ranked candidate counts"),
-}
 _CONDITIONS = {
     "object": "Object",
     "distance": "Distance",
     "lateral": "Lateral position",
     "pitch_deg": "Pitch [°]",
     "occlusion": "Share of the object that is hidden",
+    "clutter": "Neighbours",
+    "physics_noise": "Physics noise",
 }
-_COUNTS = {
-    "n_candidates": "generated",
-    "n_free": "free of the point cloud",
-    "n_ranked": "ranked",
-    "rank": "rank of the executed (0 is first)",
-}
-_STYLE = """body{font:15px/1.5 system-ui,sans-serif;max-width:72rem;margin:2rem auto;padding:0 1rem;color:#1a202c;
-background:#fff}h1,h2{line-height:1.2}h2{margin-top:2.2rem}figcaption,small{color:#4a5568}
-figure{margin:.5rem 0;max-width:100%}svg{max-width:100%;height:auto}.row{display:flex;flex-wrap:wrap;gap:.5rem 2rem}
-table{border-collapse:collapse}td,th{padding:.2rem 1rem .2rem 0;text-align:left;border-bottom:1px solid #e2e8f0}
-.legend span{margin-right:1.2rem;white-space:nowrap}.legend i{display:inline-block;width:.8em;height:.8em;
-margin-right:.35em}pre{background:#f7fafc;padding:.6rem;white-space:pre-wrap;overflow-wrap:anywhere}
-.pictures figure{width:21rem}.pictures img{width:100%}"""
+_ALWAYS = ("object", "distance", "lateral", "pitch_deg")
+"""Conditions that are plotted even where there is but one value."""
+_STYLE = """:root{color-scheme:light}body{font:15px/1.55 system-ui,sans-serif;max-width:74rem;margin:0 auto;
+padding:2rem 1.5rem 4rem;color:#1a202c;background:#fff}h1{font-size:2rem;margin:0 0 .3rem}h1,h2,h3{line-height:1.2}
+h2{margin:2.8rem 0 .8rem;padding-bottom:.35rem;border-bottom:2px solid #e2e8f0}
+h3{margin:1.6rem 0 .4rem;font-size:1.02rem}figcaption,small{color:#4a5568}
+figure{margin:.5rem 0;max-width:100%}svg{max-width:100%;height:auto;font-family:inherit}
+.row{display:flex;flex-wrap:wrap;gap:.5rem 2.5rem}.wide{overflow-x:auto}
+table{border-collapse:collapse;font-variant-numeric:tabular-nums}
+td,th{padding:.28rem 1.1rem .28rem 0;text-align:left;border-bottom:1px solid #e2e8f0;white-space:nowrap}
+th{color:#4a5568;font-weight:600;font-size:.88rem}td:first-child{font-weight:600}
+.cards{display:flex;flex-wrap:wrap;gap:1rem;margin:1.4rem 0}
+.card{border:1px solid #e2e8f0;border-top:4px solid;border-radius:6px;padding:.8rem 1.2rem;min-width:13rem}
+.card strong{display:block;font-size:2rem;line-height:1.25}.card span{display:block;color:#4a5568;font-size:.88rem}
+.legend span{margin-right:1.2rem;white-space:nowrap}
+.legend i{display:inline-block;width:.8em;height:.8em;margin-right:.35em;border-radius:2px}
+pre{background:#f7fafc;padding:.8rem;white-space:pre-wrap;overflow-wrap:anywhere;font-size:.8rem}
+.pictures figure{width:21.5rem}.pictures img{width:100%;border-radius:6px;display:block}a{color:#2b6cb0}"""
 
 
-def write_report(
-    rows: Sequence[Row], summary: Mapping[str, Any], path: Path, pictures: Mapping[str, bytes] | None = None
-) -> None:
+def write_report(rows: Sequence[Row], summary: Mapping[str, Any], path: Path, pictures: Sequence[Picture] = ()) -> None:
     """Write the report of a run.
 
     Args:
         rows: of all methods.
         summary: of these rows, as `sim_twin.bench.summary.write_summary` returns it.
         path: of the HTML file; it is replaced once the new one is whole.
-        pictures: JPEG files by what is said below each.
+        pictures: of chosen episodes.
     """
     names = sorted(summary["methods"], key=lambda name: list(METHODS).index(name.partition(":")[0]))
     methods = {name: summary["methods"][name] for name in names}
@@ -63,16 +62,28 @@ def write_report(
     parts = [
         f"<h1>{title}</h1>",
         _scope(rows, summary.get("run", {})),
-        "<h2>Success</h2>" + _headline(methods),
-        "<h2>Methods against each other</h2>" + _paired(summary["paired"]),
+        _cards(methods),
+        "<h2>The paper's tables, and ours</h2>",
+        f"<p><small>The paper's figures are of its own {paper.EPISODES} episodes: three objects in 27 poses. Of them "
+        "only those that stand here are known to us.</small></p>",
+        "<h3>1 Success</h3>" + tables.success(methods),
+        "<h3>2 By object</h3>" + tables.breakdown(own, ["object"]),
+        "<h3>3 By distance and lateral position</h3>" + tables.breakdown(own, ["distance", "lateral"]),
+        "<h3>4 By pitch [°]</h3>" + tables.breakdown(own, ["pitch_deg"]),
+        "<h3>5 Time [ms]</h3>" + tables.times(own),
+        "<h2>Methods against each other</h2>" + tables.paired(summary["paired"]),
+        tables.retries(own),
         *(_condition(column, words, own) for column, words in _CONDITIONS.items()),
         "<h2>Distance × lateral position</h2>" + _grids(own),
         "<h2>How episodes ended</h2>" + _modes(methods),
-        "<h2>Candidates</h2>" + _candidates(own),
-        "<h2>Latency</h2>" + _latency(own),
-        _gallery(pictures or {}),
+        "<h2>Candidates</h2>" + tables.candidates(own),
+        _gallery(pictures),
+        _settings(summary.get("run", {})),
     ]
-    head = f"<!doctype html><html lang='en'><meta charset='utf-8'><title>{title}</title><style>{_STYLE}</style>"
+    head = (
+        f"<!doctype html><html lang='en'><meta charset='utf-8'><meta name='viewport' content='width=device-width'>"
+        f"<title>{title}</title><style>{_STYLE}</style>"
+    )
     partial = path.with_suffix(".partial")
     partial.write_text(head + "\n".join(parts) + "</html>\n", encoding="utf-8")
     partial.replace(path)
@@ -84,69 +95,61 @@ def _scope(rows: Sequence[Row], run: Mapping[str, Any]) -> str:
     words = f"{len(scenarios)} scenarios, {len(rows)} episodes; seeds {', '.join(map(str, seeds))}."
     if "version" in run:
         words += f" Version {run['version']}."
-    text = escape(json.dumps(run, indent=1, ensure_ascii=False, default=str))
-    settings = f"<details><summary>What was run</summary><pre>{text}</pre></details>" if run else ""
-    return f"<p>{escape(words)}</p>{settings}"
+    return f"<p>{escape(words)}</p>"
 
 
-def _headline(methods: Mapping[str, Any]) -> str:
-    lines = []
-    for name, method in methods.items():
-        paper = PAPER_RATES.get(name)
-        lines.append(
-            [
-                name,
-                str(method["episodes"]),
-                f"{method['rate']:.1%}",
-                _interval(method["rate_95"]),
-                f"{method['rate_top1']:.1%}",
-                _interval(method["rate_top1_95"]),
-                "–" if paper is None else f"{paper:.1%} of 81",
-            ]
+def _cards(methods: Mapping[str, Any]) -> str:
+    cards = []
+    for k, (name, method) in enumerate(methods.items()):
+        known = f"the paper: {paper.RATES[name]:.1%}" if name in paper.RATES else "not in the paper"
+        cards.append(
+            f"<div class='card' style='border-top-color:{svg.COLOURS[k % len(svg.COLOURS)]}'>{escape(name)}"
+            f"<strong>{method['rate']:.1%}</strong>"
+            f"<span>{method['successes']} of {method['episodes']} lifted and held</span>"
+            f"<span>first-ranked alone: {method['rate_top1']:.1%}</span><span>{known}</span></div>"
         )
-    table = _table(["method", "episodes", "fallthrough", "95 %", "top1", "95 %", "the paper's"], lines)
-    notes = "; ".join(f"{reading}: {words}" for reading, (_, words) in _READINGS.items())
-    notes += ". The paper's figures are those of its own 81 episodes: three objects in 27 poses"
-    return f"{table}<p><small>Two readings of the same episodes. {escape(notes)}. Intervals: Wilson.</small></p>"
+    return f"<div class='cards'>{''.join(cards)}</div>"
 
 
-def _paired(pairs: Sequence[Mapping[str, Any]]) -> str:
-    if not pairs:
-        return "<p>One method only: there is nothing to compare.</p>"
-    lines = [
-        [
-            pair["reading"],
-            " and ".join(pair["methods"]),
-            str(pair["scenarios"]),
-            str(pair["only_first"]),
-            str(pair["only_second"]),
-            f"{pair['p']:.2g}",
-        ]
-        for pair in pairs
-    ]
-    table = _table(["reading", "first and second", "scenarios", "only first", "only second", "p"], lines)
-    return f"{table}<p><small>On the same scenarios and candidates; p: McNemar, exact, two-sided.</small></p>"
+def _settings(run: Mapping[str, Any]) -> str:
+    if not run:
+        return ""
+    text = escape(json.dumps(run, indent=1, ensure_ascii=False, default=str))
+    return f"<h2>What was run</h2><details><summary>Command and settings</summary><pre>{text}</pre></details>"
 
 
 def _condition(column: str, words: str, own: Mapping[str, Sequence[Row]]) -> str:
-    values = _ordered(column, {row[column] for part in own.values() for row in part})
+    values = tables.ordered(column, {row.get(column) for part in own.values() for row in part} - {None})
+    if len(values) < 2 and column not in _ALWAYS:
+        return ""
     plots = []
-    for reading, (success, _) in _READINGS.items():
+    for reading, (flag, _) in tables.READINGS.items():
         series = {
-            name: [_tally(part, success, lambda row, value=value: row[column] == value) for value in values]
+            name: [_tally(part, flag, lambda row, value=value: row.get(column) == value) for value in values]
             for name, part in own.items()
         }
-        plots.append(svg.rate_bars([_name(value) for value in values], series, f"{reading}; lines are 95 % intervals"))
-    return f"<h2>{words}</h2>{svg.legend(list(own))}<div class='row'>{''.join(plots)}</div>"
+        plots.append(svg.rate_bars([tables.said(v) for v in values], series, f"{reading}; lines are 95 % intervals"))
+    more = _knocked(own) if column == "clutter" else ""
+    return f"<h2>{words}</h2>{svg.legend(list(own))}<div class='row'>{''.join(plots)}</div>{more}"
+
+
+def _knocked(own: Mapping[str, Sequence[Row]]) -> str:
+    """Return how often neighbours were knocked."""
+    parts = []
+    for name, rows in own.items():
+        among = [row for row in rows if row.get("clutter")]
+        parts.append(f"{name} {sum(bool(row['neighbours_knocked']) for row in among)} of {len(among)}")
+    words = f"Episodes in which a neighbour was moved by more than 15 mm or 15°: {'; '.join(parts)}."
+    return f"<p><small>{escape(words)}</small></p>"
 
 
 def _grids(own: Mapping[str, Sequence[Row]]) -> str:
     rows, columns = list(reversed(DISTANCES_M)), list(LATERALS_M)
     plots = []
     for name, part in own.items():
-        for reading, (success, _) in _READINGS.items():
+        for reading, (flag, _) in tables.READINGS.items():
             cells = {
-                (r, c): _tally(part, success, lambda row, r=r, c=c: (row["distance"], row["lateral"]) == (r, c))
+                (r, c): _tally(part, flag, lambda row, r=r, c=c: (row["distance"], row["lateral"]) == (r, c))
                 for r in rows
                 for c in columns
             }
@@ -159,77 +162,21 @@ def _modes(methods: Mapping[str, Any]) -> str:
     return svg.share_bars(modes, "success", "Episodes by how they ended (fallthrough).")
 
 
-def _candidates(own: Mapping[str, Sequence[Row]]) -> str:
-    refused = sorted({column for part in own.values() for row in part for column in row if _is_refusal(column)})
-    lines = []
-    for name, part in own.items():
-        medians = [_figure(_values(part, column), np.median, "{:.0f}") for column in _COUNTS]
-        means = [_figure(_values(part, column), np.mean, "{:.1f}") for column in refused]
-        lines.append([name, *medians, *means])
-    head = ["method", *_COUNTS.values(), *(f"refused: {column.removeprefix('rejected_')}" for column in refused)]
-    note = "Medians an episode; refused: by the planner before it took one, or all if it took none; means an episode."
-    return f"{_table(head, lines)}<p><small>{note}</small></p>"
-
-
-def _latency(own: Mapping[str, Sequence[Row]]) -> str:
-    lines = []
-    for name, part in own.items():
-        values = [_values(part, column) for column in STAGES]
-        totals = np.array([sum(row.get(column) or 0.0 for column in STAGES) for row in part])
-        lines += [
-            [name if label == "median" else "", label, *(_figure(v, of, "{:.1f}") for v in (*values, totals))]
-            for label, of in (("median", np.median), ("95 %", lambda v: np.percentile(v, 95)))
-        ]
-    head = ["method", "[ms]", *(column.removesuffix("_ms") for column in STAGES), "together"]
-    note = "With several episodes side by side stages wait for each other: a deployed arm's are shorter."
-    return f"{_table(head, lines)}<p><small>{note}</small></p>"
-
-
-def _gallery(pictures: Mapping[str, bytes]) -> str:
+def _gallery(pictures: Sequence[Picture]) -> str:
     if not pictures:
         return ""
     figures = "".join(
-        f"<figure><img src='data:image/jpeg;base64,{b64encode(jpeg).decode()}' alt=''>"
-        f"<figcaption>{escape(words)}</figcaption></figure>"
-        for words, jpeg in pictures.items()
+        f"<figure><img src='data:image/jpeg;base64,{b64encode(picture.jpeg).decode()}' alt=''>"
+        f"<figcaption>{escape(picture.words)}{_link(picture.recording)}</figcaption></figure>"
+        for picture in pictures
     )
     return f"<h2>Failures, as they ended</h2><div class='row pictures'>{figures}</div>"
+
+
+def _link(recording: str) -> str:
+    return f" · <a href='{quote(recording)}'>what it saw and chose (.rrd, for Rerun)</a>" if recording else ""
 
 
 def _tally(rows: Sequence[Row], column: str, belongs: Callable[[Row], bool]) -> svg.Tally:
     part = [bool(row[column]) for row in rows if belongs(row)]
     return sum(part), len(part)
-
-
-def _ordered(column: str, values: set[Any]) -> list[Any]:
-    """Return `values` as people count them: near to far, left to right, small to large."""
-    order = {"distance": list(DISTANCES_M), "lateral": list(LATERALS_M)}.get(column)
-    return sorted(values, key=order.index if order else None)
-
-
-def _name(value: Any) -> str:
-    return f"{value:g}" if isinstance(value, float) else str(value)
-
-
-def _values(rows: Sequence[Row], column: str) -> np.ndarray:
-    """Return what rows have in `column`; −1 stands for a count that was never made."""
-    values = np.array([row[column] for row in rows if row.get(column) is not None], dtype=float)
-    return values[np.isfinite(values) & (values >= 0)]
-
-
-def _is_refusal(column: str) -> bool:
-    return column.startswith("rejected_")
-
-
-def _figure(values: np.ndarray, of: Callable[[np.ndarray], Any], form: str) -> str:
-    return form.format(float(of(values))) if len(values) else "–"
-
-
-def _interval(interval: Sequence[float]) -> str:
-    return f"{interval[0]:.1%} to {interval[1]:.1%}"
-
-
-def _table(head: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
-    top = "".join(f"<th>{escape(word)}</th>" for word in head)
-    body = "".join("<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in line) + "</tr>" for line in lines)
-    return f"<table><tr>{top}</tr>{body}</table>"

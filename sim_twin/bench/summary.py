@@ -14,9 +14,9 @@ import numpy as np
 from sim_twin.bench.rows import Row
 from sim_twin.bench.stats import mcnemar, wilson
 
-CONDITIONS = ("object", "distance", "lateral", "pitch_deg", "occlusion")
+CONDITIONS = ("object", "distance", "lateral", "pitch_deg", "occlusion", "clutter", "physics_noise")
 """Columns by which success is broken down."""
-STAGES = ("detect_ms", "cloud_ms", "generate_ms", "rank_ms", "collision_ms", "ik_ms", "plan_ms")
+STAGES = ("detect_ms", "cloud_ms", "generate_ms", "filter_ms", "rank_ms", "collision_ms", "ik_ms", "plan_ms")
 """Columns that hold a decision's times."""
 _COUNTS = ("n_candidates", "n_free", "n_ranked", "rank")
 
@@ -45,6 +45,7 @@ def summarise_method(rows: Sequence[Row]) -> dict[str, Any]:
         "successes_top1": top1,
         "rate_top1": top1 / n if n else float("nan"),
         "rate_top1_95": wilson(top1, n),
+        "rate_after": _rates_after(rows),
         "modes": dict(Counter(row["mode"] for row in rows).most_common()),
         "by": {column: _breakdown(rows, column) for column in CONDITIONS},
         "counts": {column: _median(rows, column) for column in _COUNTS},
@@ -64,7 +65,8 @@ def write_summary(rows: Sequence[Row], path: Path, run: dict[str, Any]) -> dict[
 def _breakdown(rows: Sequence[Row], column: str) -> dict[str, dict[str, Any]]:
     parts: dict[str, list[Row]] = {}
     for row in rows:
-        parts.setdefault(str(row[column]), []).append(row)
+        if row.get(column) is not None:
+            parts.setdefault(str(row[column]), []).append(row)
     return {
         value: {
             "episodes": len(part),
@@ -75,6 +77,13 @@ def _breakdown(rows: Sequence[Row], column: str) -> dict[str, dict[str, Any]]:
         }
         for value, part in parts.items()
     }
+
+
+def _rates_after(rows: Sequence[Row]) -> list[float]:
+    """Return the rate of success within one, two, … attempts, as many as any row had."""
+    after = [row["success_after"] for row in rows if row.get("success_after")]
+    most = max(map(len, after), default=0)
+    return [float(np.mean([flags[min(k, len(flags) - 1)] for flags in after])) for k in range(most)]
 
 
 def _compare(a: str, b: str, by_method: dict[str, list[Row]], reading: str) -> dict[str, Any]:

@@ -25,9 +25,15 @@ def test_without_the_extra_it_says_how_to_get_it(monkeypatch):
 
 
 @needs_ray
-def test_a_cluster_that_is_not_there_is_named():
-    with pytest.raises(ClusterError, match=r"127.0.0.1:1.*ray start --head"):
-        next(run_tasks_on_ray(TASKS, "127.0.0.1:1"))
+def test_a_cluster_that_is_not_there_is_named(monkeypatch):
+    import ray
+
+    def init(**_):  # its own patience is a minute and a half
+        raise ConnectionError("nobody there")
+
+    monkeypatch.setattr(ray, "init", init)
+    with pytest.raises(ClusterError, match=r"'10.0.0.1:6379' \(nobody there\).*ray start --head"):
+        next(run_tasks_on_ray(TASKS, "10.0.0.1:6379"))
 
 
 @needs_ray

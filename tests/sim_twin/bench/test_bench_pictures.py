@@ -37,13 +37,19 @@ def test_the_final_state_is_drawn_from_the_row(tmp_path, monkeypatch: pytest.Mon
     shown = draw_pictures(rows, "failures", tmp_path / "pictures")
     (file,) = (tmp_path / "pictures").iterdir()
     assert file.name == "mug-mid-centre-+0-s0-mvb_k_3.png"
-    ((words, jpeg),) = shown.items()
-    assert words == "mug-mid-centre-+0-s0, mvb:k=3: missed"
-    large, small = Image.open(file).convert("RGB"), Image.open(io.BytesIO(jpeg))
+    ((of, picture),) = shown
+    assert of is rows[0]
+    assert picture.words == "mug-mid-centre-+0-s0, mvb:k=3: missed"
+    large, small = Image.open(file).convert("RGB"), Image.open(io.BytesIO(picture.jpeg))
     again = np.asarray(small.resize(large.size), dtype=float)
     assert np.abs(again - np.asarray(large)).mean() < 8.0
 
 
 def test_no_pictures_are_drawn_unless_asked_for(tmp_path):
-    assert draw_pictures([row("mvb", "missed")], "none", tmp_path / "pictures") == {}
+    assert draw_pictures([row("mvb", "missed")], "none", tmp_path / "pictures") == []
     assert not (tmp_path / "pictures").exists()
+
+
+def test_an_object_whose_mesh_is_not_given_again_is_left_out(tmp_path):
+    gone = {**row("mvb", "missed"), "object": "drill-12345678"}
+    assert draw_pictures([gone], "failures", tmp_path / "pictures") == []

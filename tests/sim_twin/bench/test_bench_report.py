@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from sim_twin.bench import svg
+from sim_twin.bench.pictures import Picture
 from sim_twin.bench.report import write_report
 from sim_twin.bench.scenarios import grid
-from sim_twin.bench.summary import summarise
+from sim_twin.bench.summary import STAGES, summarise
 
 MODES = ("missed", "object knocked", "no IK", "no path", "slipped", "dropped", "table collision", "no candidate")
 
@@ -89,9 +90,14 @@ def test_one_method_alone_and_names_with_markup_are_shown_too(tmp_path):
 
 
 def test_pictures_are_in_the_page(tmp_path):
-    page = write(tmp_path / "report.html", make_rows(("mvb",)), pictures={"box: missed": b"jpeg"})
+    page = write(
+        tmp_path / "report.html",
+        make_rows(("mvb",)),
+        pictures=[Picture(words="box: missed", jpeg=b"jpeg", recording="recordings/a b.rrd")],
+    )
     assert f"data:image/jpeg;base64,{b64encode(b'jpeg').decode()}" in page
     assert "box: missed" in page
+    assert "href='recordings/a%20b.rrd'" in page
 
 
 def test_bars_are_as_long_as_the_rates_and_nothing_lies_on_another():
@@ -114,3 +120,45 @@ def test_shares_fill_the_bar_and_the_first_leads():
     widths = [float(w) for w in re.findall(r'<rect[^>]* width="([\d.]+)"', plot)]
     assert widths[0] == pytest.approx(3 * widths[1])
     assert plot.index("success</span>") < plot.index("missed</span>")
+
+
+def test_the_papers_known_figures_stand_beside_ours_and_no_others(page):
+    start = page.index("<h2>The paper's tables, and ours</h2>")
+    tables = page[start : page.index("<h2>Methods against each other")]
+    assert re.findall(r"<h3>(\d)", tables) == ["1", "2", "3", "4", "5"]
+    papers = re.findall(r"<tr>(<td></td><td>the paper&#x27;s</td>.*?)</tr>", tables)
+    assert len(papers) == 3 * 2
+    for line, rate in zip(papers, ("24.7%", "59.3%") * 3, strict=True):
+        figures = re.findall("<td>(.*?)</td>", line)[2:]
+        assert figures[0] == rate
+        assert set(figures[1:]) == {"–"}
+    assert re.findall("<td>the paper&#x27;s</td><td></td>(.*)", tables)[0].count("–") == len(STAGES) + 1 - 3
+
+
+def test_tables_give_the_rate_of_each_condition(tmp_path):
+    rows = make_rows(("mvb",))
+    page = write(tmp_path / "report.html", rows)
+    boxes = [row["success"] for row in rows if row["object"] == "box"]
+    (head,) = re.findall(r"<h3>2 By object</h3>.*?<tr>(.*?)</tr>", page)
+    assert re.findall("<th>(.*?)</th>", head) == ["method", "", "all", "bottle", "box", "cylinder"]
+    (line,) = re.findall(r"<h3>2 By object</h3>.*?<tr>.*?</tr><tr>(.*?)</tr>", page)
+    assert re.findall("<td>(.*?)</td>", line)[4] == f"{np.mean(boxes):.1%}"
+
+
+def test_retries_neighbours_and_noise_are_shown_where_there_were_any(tmp_path):
+    rows = make_rows(("mvb",))
+    for k, row in enumerate(rows):
+        after = [False, k % 2 == 0, k % 4 != 1]
+        row |= {
+            "top_k": 3,
+            "attempts": 2,
+            "success_after": after,
+            "clutter": k % 3,
+            "neighbours_knocked": int(k % 9 == 1),
+        }
+    page = write(tmp_path / "report.html", rows)
+    assert "<td>mvb</td><td>0.0%</td><td>50.6%</td><td>75.3%</td><td>2.00</td>" in page
+    assert "<h2>Neighbours</h2>" in page
+    assert "15 mm or 15°: mvb 9 of 54." in page
+    plain = write(tmp_path / "plain.html", make_rows(("mvb",)))
+    assert not any(words in plain for words in ("Retries", "Neighbours", "Physics noise"))

@@ -47,3 +47,12 @@ def test_the_table_holds_every_row(tmp_path):
     store.add(rows("a"))
     store.add(rows("b", faces=[0, 2]))
     assert pq.read_table(store.write_table()).num_rows == 4
+
+
+def test_lists_that_were_empty_and_lists_that_were_not_make_one_table(tmp_path):
+    store = Store(tmp_path, resume=False)
+    store.add(rows("a", neighbours=[], modes=["missed"], success_after=[False]))
+    store.add(rows("b", neighbours=["box"], modes=["missed", "success"], success_after=[False, True]))
+    store.add([{"scenario": "c", "method": "mvb", "success": True}])
+    assert [row["neighbours"] for row in store.rows()] == [[], [], ["box"], ["box"], None]
+    assert store.write_table().exists()
