@@ -62,7 +62,8 @@ class Orders:
 
     def __init__(self, limits: ServoLimits, lease_timeout_s: float | None, guard: Guard | None = None) -> None:
         self._limits = limits
-        self._guard = guard
+        self.guard = guard
+        """May be set as long as nothing moves."""
         self._lock = Lock()
         self.lease = Lease(lease_timeout_s)
         self.reset()
@@ -170,7 +171,7 @@ class Orders:
             running = self.current
             if running is not None:
                 raise CommandRefusedError(f"trajectory {running.trajectory_id} is playing; let it end or release() it.")
-            if self._guard and (refusal := self._guard.refusal(setpoint.q[None], snapshot.q_sent)):
+            if self.guard and (refusal := self.guard.refusal(setpoint.q[None], snapshot.q_sent)):
                 raise GuardError(f"the setpoint {refusal[1]}.")
             self.target = Target(setpoint, now_s)
             self.beyond += bool(((setpoint.q < self._limits.q_min) | (setpoint.q > self._limits.q_max)).any())
@@ -190,10 +191,10 @@ class Orders:
             self.cancelled_id = self.playback.trajectory_id
 
     def _check_space(self, new: playback.Playback, chunk: TrajectoryChunk, snapshot: Snapshot) -> None:
-        if self._guard is None:
+        if self.guard is None:
             return
         start_s = float(chunk.t_s[0])
-        refusal = self._guard.refusal(new.sampled(start_s, _CHECK_EVERY_S), snapshot.q_sent)
+        refusal = self.guard.refusal(new.sampled(start_s, _CHECK_EVERY_S), snapshot.q_sent)
         if refusal is not None:
             index, what = refusal
             raise GuardError(f"trajectory {chunk.trajectory_id} {what} (t = {start_s + index * _CHECK_EVERY_S:.2f} s).")

@@ -78,9 +78,8 @@ def serve(
     """
     if rig.call_every_tick is not None:
         raise ValueError("a lock-step rig has no time of its own to be served by; make it with the wall clock.")
-    guard = Guard(workspace)
     kind = ReadonlyServo if readonly else Servo
-    servo = kind(rig.arm, rig.clock, limits, heartbeat_timeout_s=HEARTBEAT_TIMEOUT_S, guard=guard)
+    servo = kind(rig.arm, rig.clock, limits, heartbeat_timeout_s=HEARTBEAT_TIMEOUT_S)
     ticking = ServoThread(servo, rig.clock, cpu=cpu)
     ending = _Ending(servo, ticking, rig.park, hurry_event or Event())
     with ExitStack() as undo:  # in reverse order, whatever of it was reached
@@ -88,6 +87,7 @@ def serve(
         undo.callback(servo.disconnect)
         undo.callback(ending.soften)
         undo.callback(rig.camera.disconnect)
+        servo.keep_inside(Guard(workspace))  # a second to load: whoever has no arm need not wait for it
         ticking.start()
         undo.callback(ticking.stop)
         _await_first_tick(servo, ticking)

@@ -85,6 +85,10 @@ class Servo:
         self._orders.reset()
         self._reset(state)
 
+    def keep_inside(self, guard: Guard) -> None:
+        """Let `guard` check whatever is commanded from now on; for before anything ticks."""
+        self._guard = self._orders.guard = guard
+
     def disconnect(self) -> None:
         """Let go of the arm, which holds where it is. Brake first (`stop`) if it moves; end a `ServoThread` first."""
         self._snapshot = None

@@ -20,6 +20,7 @@ from typing import Annotated
 
 import tyro
 
+from hal.backends.real_rig import SEARCH_S
 from hal.backends.z1_config import Z1ArmConfig, Z1Mode
 from hal.bus.session import BusConfig
 from hal.guard import Workspace
@@ -39,7 +40,7 @@ class Config:
 
     rig: Annotated[RigWord, tyro.conf.arg(name="")] = field(default_factory=RigWord)
     """Which hardware."""
-    arm: Z1ArmConfig = field(default_factory=Z1ArmConfig)
+    arm: Z1ArmConfig = field(default_factory=lambda: Z1ArmConfig(connect_timeout_s=SEARCH_S))
     """Real: where the Z1's controller is, and how it is used."""
     readonly: bool = False
     """Publish what arm and camera measure, and refuse to command the arm."""

@@ -58,9 +58,9 @@ class FaultsTable:
 
 def describe(status: ServoStatus, moved: np.ndarray) -> str:
     """Say what an arm did that has `status` now and went by `moved` (7,) [rad] since the fault."""
-    what = {ServoMode.STOPPED: "brakes, holds, stays stopped", ServoMode.HOLDING: "brakes and holds"}
+    what = {ServoMode.STOPPED: "braked, stopped until re-armed", ServoMode.HOLDING: "braked, holds"}
     joint = int(np.abs(moved[:N_ARM]).argmax())
-    further = f"{JOINT_NAMES[joint]} {1e3 * abs(moved[joint]):.0f} mrad further"
+    further = f"{JOINT_NAMES[joint]} went on by {1e3 * abs(moved[joint]):.0f} mrad"
     return f"{what.get(status.mode, status.mode.value)}; {further}"
 
 

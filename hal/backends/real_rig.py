@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from hal.backends.d405_session import D405CameraConfig
 from hal.backends.z1_arm import Z1Arm
 from hal.backends.z1_config import Z1ArmConfig
 from hal.clock import WallClock
@@ -11,6 +12,9 @@ from hal.parking import Parking
 from hal.registry import CAMERAS
 from hal.rig import Rig
 from hal.wire.controller import LABELS
+
+SEARCH_S = 1.0
+"""How long arm and camera are looked for: whoever has neither knows it 3 s after he has asked [s]."""
 
 
 def make_rig(*, arm: Z1ArmConfig | None = None, camera: Any = None, **_: Any) -> Rig:
@@ -22,10 +26,10 @@ def make_rig(*, arm: Z1ArmConfig | None = None, camera: Any = None, **_: Any) ->
         **_: options of other rigs.
     """
     clock = WallClock()
-    z1_arm = Z1Arm(clock, arm)
+    z1_arm = Z1Arm(clock, arm or Z1ArmConfig(connect_timeout_s=SEARCH_S))
     return Rig(
         arm=z1_arm,
-        camera=CAMERAS.make("d405", clock=clock, config=camera),
+        camera=CAMERAS.make("d405", clock=clock, config=camera or D405CameraConfig(search_s=SEARCH_S)),
         clock=clock,
         independent=True,
         park=Parking(q=LABELS["startFlat"], soften=z1_arm.go_passive),

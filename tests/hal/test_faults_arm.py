@@ -73,3 +73,18 @@ def test_a_clock_that_jumps(faults_table: FaultsTable) -> None:
     bench.assert_safe()
     assert bench.status.mode is not ServoMode.TRACKING
     bench.tell(faults_table, "clock jumps by 1 h, as after a suspend")
+
+
+def test_a_push_that_is_stronger_than_a_motor(faults_table: FaultsTable) -> None:
+    push_nm, push_s = 33.0, 0.3
+    bench = WiredBench()
+
+    def push() -> None:
+        lasts = bench.world.time_s < bench.fault_s + push_s
+        bench.world.data.qfrc_applied[0] = -push_nm if lasts else 0.0
+
+    bench.play(lambda: bench.twin_clock.call_every_tick(push))
+    bench.assert_safe()
+    assert bench.status.mode is ServoMode.STOPPED
+    assert bench.status.reason.startswith("joint1")
+    bench.tell(faults_table, f"joint1 pushed back with {push_nm:.0f} Nm for {push_s:.1f} s")

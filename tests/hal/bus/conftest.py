@@ -95,6 +95,13 @@ def moving(servo) -> bool:
     return status.mode is ServoMode.TRACKING and status.trajectory_time_s > 0.3
 
 
+def set_off(arm) -> None:
+    """Begin a motion, unless one is on its way: on a busy machine one may have been given up for lost."""
+    status = arm.status()
+    if status.mode is ServoMode.HOLDING:
+        arm.stream(slow_motion(status.trajectory_id + 1, start=status.q_command))
+
+
 @pytest.fixture
 def hal() -> Iterator[Hal]:
     clock = WallClock()

@@ -6,17 +6,17 @@ import signal
 
 import numpy as np
 import pytest
-from conftest import end_processes, free_config, moving, slow_motion, start_python, wait_until
+from conftest import end_processes, free_config, moving, set_off, start_python, wait_until
 from faults_table import FaultsTable
 
 from hal import z1
 from hal.bus.client import RemoteArm
 from hal.errors import HalTimeoutError
-from hal.messages import ServoMode
 from sim_twin.controlled_world import ControlledWorld
 from sim_twin.scene import SceneConfig
+from sim_twin.wire_config import WireConfig
 from sim_twin.wire_rig import free_ports
-from sim_twin.wire_server import WireConfig, WireServer
+from sim_twin.wire_server import WireServer
 from sim_twin.world import World
 
 SERVE = """
@@ -50,13 +50,6 @@ class WatchedWorld(World):
         self.steps.append((self.time_s, q, dq))
 
 
-def _set_off(arm: RemoteArm) -> None:
-    """Begin a motion, unless one is on its way: on a busy machine one may have been given up for lost."""
-    status = arm.status()
-    if status.mode is ServoMode.HOLDING:
-        arm.stream(slow_motion(status.trajectory_id + 1, start=status.q_command))
-
-
 @pytest.mark.faults
 def test_a_killed_hal_leaves_an_arm_that_holds(faults_table: FaultsTable) -> None:
     config = free_config(connect_timeout_s=30.0)
@@ -71,7 +64,7 @@ def test_a_killed_hal_leaves_an_arm_that_holds(faults_table: FaultsTable) -> Non
             assert hal.stdout.readline() == "ready\n"
             with RemoteArm(config) as arm:
                 arm.claim()
-                wait_until(lambda: moving(arm) or _set_off(arm), 60.0)
+                wait_until(lambda: moving(arm) or set_off(arm), 60.0)
                 killed_s, q, _ = world.steps[-1]
                 hal.send_signal(signal.SIGKILL)
                 wait_until(lambda: world.time_s > killed_s + 1.0, 60.0)
