@@ -28,7 +28,7 @@ HEARTBEAT_TIMEOUT_S = 0.15
 """How long the owner may be silent in motion [s]."""
 _BRAKING_S = 2.0
 _LOOK_S = 0.05
-_COLLECT_EVERY = 100
+_COLLECT_EVERY = 1200  # looks: once a minute
 
 
 def stop_on_signals(stop_event: Event, hurry_event: Event | None = None) -> None:
