@@ -115,7 +115,7 @@ def serve(connection: Connection, scene: SceneConfig, calibration: Calibration, 
 
     world, model, frames = files
     view, frame = _SharedView(scene, SharedWorld(world), load_model(model)), map_memory(frames, _FRAME)
-    with TwinSource(view, WallClock(), calibration=calibration) as source:
+    with TwinSource(view, WallClock(), calibration=calibration, gives_way=False) as source:
         connection.send(None)
         while True:
             look = connection.recv()

@@ -7,7 +7,8 @@ import numpy as np
 from hal import z1
 from hal.wire.board import PERIOD_S
 from hal.wire.controller import decode_command, encode_state
-from hal.wire.records import WireError
+from hal.wire.records import JointStates, WireError
+from hal.wire.states import Fsm
 from sim_twin.controller import Controller
 from sim_twin.motors import Motors
 from sim_twin.world import World
@@ -18,8 +19,8 @@ _BOARD_TICKS = round(PERIOD_S / z1.CONTROL_PERIOD_S)
 class ControlledWorld:
     """Controller and motors of one world; no sockets, no clock, no thread.
 
-    Until the first command nothing is told to the motors, and the arm stays where it is parked. Commands and
-    measurements pass between controller and motors at 250 Hz, so every second answer repeats the measurement.
+    Until the first command nothing is told to the motors, and the arm stays where it is parked. The controller works,
+    and exchanges commands and measurements with the motors, at 250 Hz, so every second answer repeats the measurement.
 
     Args:
         world: whose arm it is; who owns it calls `tick` before each of its steps.
@@ -40,6 +41,8 @@ class ControlledWorld:
         self.controller = Controller(self._measured)
         self._ticks = 0
         self._heard = False
+        self._told: tuple[Fsm, JointStates] | None = None
+        self._answer = b""
 
     def hear(self, data: bytes | memoryview) -> None:
         """Obey a datagram; what is answered, `tell` says."""
@@ -63,7 +66,10 @@ class ControlledWorld:
 
     def answer(self) -> bytes:
         """Return what the controller tells now, 208 B."""
-        return encode_state(self.controller.answer())
+        now = self.controller.fsm, self.controller.measured
+        if self._told is None or now[0] is not self._told[0] or now[1] is not self._told[1]:  # every second one repeats
+            self._told, self._answer = now, encode_state(self.controller.answer())
+        return self._answer
 
     def handle(self, data: bytes | memoryview) -> bytes | None:
         """Obey a datagram and return the answer; None when it was refused."""
@@ -71,11 +77,16 @@ class ControlledWorld:
 
     def tick(self) -> None:
         """Let the controller work for 2 ms; to be called before each step of the world."""
-        exchange = self._ticks % _BOARD_TICKS == 0 and not self.motors.silent
+        if self._ticks % _BOARD_TICKS == 0:
+            self._exchange()
         self._ticks += 1
-        if exchange:
-            self._measured = self.motors.measure()
-        told = self.controller.step(self._measured, z1.CONTROL_PERIOD_S)
-        if exchange and self.awake:
-            self.motors.obey(told)
         self.motors.tick()
+
+    def _exchange(self) -> None:
+        """Let the controller do its 4 ms of work, and exchange commands for measurements if the board speaks."""
+        heard = not self.motors.silent
+        if heard:
+            self._measured = self.motors.measure()
+        told = self.controller.step(self._measured, PERIOD_S)
+        if heard and self.awake:
+            self.motors.obey(told)

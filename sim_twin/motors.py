@@ -26,13 +26,13 @@ OVERHEAT_C = 95.0
 """A motor as hot as this reports it, and lets go until its error bit is cleared, as by switching off and on [°C]."""
 
 _PERIOD_S = z1.CONTROL_PERIOD_S
-_HEAT_TICKS = 50
+_LOOK_TICKS, _HEAT_TICKS = 5, 50
 _LETS_GO = np.uint8(MotorError.OVER_CURRENT | MotorError.OVERHEAT)
 _MOTORS = np.ones(z1.N_JOINTS)
 _MOTORS[1] = 2.0
 _REAL = np.arange(2) < _MOTORS[:, None]
 _MOTOR_TAU_MAX = (z1.TAU_MAX / _MOTORS)[:, None]
-_LIMP_KD = KD_SCALE * KD_PASSIVE
+_FIELDS = ("q", "dq", "tau", "kp", "kd")
 
 
 class Motors:
@@ -54,7 +54,7 @@ class Motors:
         """(7, 2) [°C]."""
         self.awake = False
         """Whether a command has come."""
-        self._told = {name: np.zeros(z1.N_JOINTS) for name in ("q", "dq", "tau", "kp", "kd")}
+        self._told = JointCommands()
         self._unheard_s = np.zeros(z1.N_JOINTS)
         self._limp = np.zeros(z1.N_JOINTS, dtype=bool)
         self._ticks = 0
@@ -73,10 +73,16 @@ class Motors:
     def obey(self, commands: JointCommands) -> None:
         """Pass commands on, of all seven joints or of the six without the gripper, to the motors that hear them."""
         self.awake = True
+        if len(commands.q) == z1.N_JOINTS and not self._limp.any() and not (self.error.any() or self.link.any()):
+            self._told, self._unheard_s[:] = commands, 0.0
+            self._drive(commands)
+            return
         heard = self._working(errors=False).any(axis=1)
         heard[len(commands.q) :] = False
-        for name, told in self._told.items():
-            told[heard] = getattr(commands, name)[heard[: len(commands.q)]]
+        told = {name: getattr(self._told, name).copy() for name in _FIELDS}
+        for name, values in told.items():
+            values[heard] = getattr(commands, name)[heard[: len(commands.q)]]
+        self._told = JointCommands(**told)
         self._unheard_s[heard] = 0.0
         self._act()
 
@@ -87,7 +93,7 @@ class Motors:
             self.warm(_HEAT_TICKS * _PERIOD_S)
         if self.awake:
             self._unheard_s += _PERIOD_S
-            if (self._lets_go() != self._limp).any():
+            if self._ticks % _LOOK_TICKS == 0 and (self._lets_go() != self._limp).any():
                 self._act()
 
     def warm(self, dt_s: float) -> None:
@@ -128,11 +134,17 @@ class Motors:
         limp = self._limp = self._lets_go()
         told = self._told
         share = self._working(errors=True).sum(axis=1) / _MOTORS
-        self.world.set_motors(
-            told["q"],
-            np.where(limp, 0.0, told["dq"]),
-            np.where(limp, 0.0, told["tau"]),
-            np.where(limp, 0.0, KP_SCALE * told["kp"]),
-            np.where(limp, _LIMP_KD, KD_SCALE * told["kd"]),
-            tau_max=np.where(share > 0.0, share, 1.0) * z1.TAU_MAX,
+        self._drive(
+            JointCommands(
+                q=told.q,
+                dq=np.where(limp, 0.0, told.dq),
+                tau=np.where(limp, 0.0, told.tau),
+                kp=np.where(limp, 0.0, told.kp),
+                kd=np.where(limp, KD_PASSIVE, told.kd),
+            ),
+            np.where(share > 0.0, share, 1.0) * z1.TAU_MAX,
         )
+
+    def _drive(self, told: JointCommands, tau_max: np.ndarray = z1.TAU_MAX) -> None:
+        kp, kd = KP_SCALE * told.kp, KD_SCALE * told.kd
+        self.world.set_motors(told.q, told.dq, told.tau, kp, kd, tau_max=tau_max)

@@ -30,6 +30,7 @@ class TwinSource:
         clock: a `TwinClock` of that world for lock-step (the default for a `World`), any other for free run.
         renderer: one of `sim_twin.gl.RENDERERS`; by default what the environment says.
         calibration: of the unit; by default figures of real ones.
+        gives_way: whether it draws at low priority in free run, as in the process of a servo it must.
     """
 
     def __init__(
@@ -38,6 +39,8 @@ class TwinSource:
         clock: Clock | None = None,
         renderer: str | None = None,
         calibration: Calibration | None = None,
+        *,
+        gives_way: bool = True,
     ) -> None:
         self.world = world
         if clock is None:
@@ -48,6 +51,7 @@ class TwinSource:
         self.attached = True
         """Set it to False to pull the cable."""
         self._kind = renderer
+        self._gives_way = gives_way and not self.lockstep
         self._snapshot = mujoco.MjData(world.model)
         self._optics: Optics | None = None
         self._renderer: WristRenderer | None = None
@@ -60,7 +64,7 @@ class TwinSource:
             CameraError: the renderer asked for cannot be had.
         """
         if self._thread is None:
-            initializer = None if self.lockstep else give_way
+            initializer = give_way if self._gives_way else None
             self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="twin-d405", initializer=initializer)
         return self._thread.submit(self._expose, look).result()
 
