@@ -1,27 +1,40 @@
-"""Run a script written for pyrealsense2, unmodified, on the twin's D405.
+"""Run a script written for pyrealsense2 or for the Z1's vendor module, unmodified, on the twin.
 
     ./z1 twin run-script --object box --frames 100 viewer.py --its-own options
 
-In the script `import pyrealsense2` gives librealsense with the twin for a camera. The scene stands still. Windows that
-OpenCV cannot open here are written to files when the script ends.
+In the script `import pyrealsense2` gives librealsense with the twin for a camera, and `import unitree_arm_interface`
+the vendor's names for an arm that stands in the same scene, at its own controller: nothing of a real arm is touched.
+Windows that OpenCV cannot open here are written to files when the script ends.
 """
 
 from __future__ import annotations
 
+import atexit
 import runpy
 import sys
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Literal
 
 import tyro
 
-from hal.clock import Clock, WallClock
+from hal.clock import Clock
+from hal.errors import CommandRefusedError
 from scripts.script_windows import windows_as_files
+
+if TYPE_CHECKING:
+    from hal.backends.z1_arm import Z1Arm
+    from hal.backends.z1_config import Z1ArmConfig
+    from hal.d405 import FrameSource
+    from hal.unitree_arm_interface import UDPPort
+    from sim_twin.scene import SceneConfig
 
 
 @dataclass(frozen=True, kw_only=True)
 class Config:
-    """What the camera looks at, and how."""
+    """What stands where, and how time passes."""
 
     file: tyro.conf.Positional[Path]
     """The script; what stands behind it is handed to it."""
@@ -33,10 +46,13 @@ class Config:
     """How far to the left [m]."""
     pitch_deg: float = 0.0
     """Lean about the base's y axis [°]."""
+    start: Literal["home", "startFlat"] = "home"
+    """How the arm lies until the first command comes: looking ahead, or folded, as the real one is switched on."""
     seed: int = 0
     """Of the camera's noise."""
     lockstep: bool = False
-    """Frames are made when the script waits for them, the same ones every time; else at their rate, by the wall."""
+    """Frames are made when the script waits for them, the same ones every time, and the arm stands still; else all
+    goes by the wall's clock."""
     frames: int = 0
     """After so many pictures shown, waitKey() answers Esc and q in turn; 0 = never."""
     windows: Path = Path("out/run-script")
@@ -49,11 +65,7 @@ def main(arguments: list[str]) -> int:
     config = tyro.cli(Config, prog="z1 twin run-script", description=__doc__, args=arguments[:end])
     if not config.file.is_file():
         raise ValueError(f"there is no script {config.file}.")
-    import hal.realsense as rs
-    from sim_twin.clock import TwinClock
-    from sim_twin.realsense_source import TwinSource
     from sim_twin.scene import SceneConfig
-    from sim_twin.world import World
 
     scene = SceneConfig(
         object=config.object,
@@ -62,12 +74,71 @@ def main(arguments: list[str]) -> int:
         pitch_deg=config.pitch_deg,
         seed=config.seed,
     )
+    robot = lockstep_robot(scene) if config.lockstep else wired_robot(scene, config.start)
+    with robot as clock, windows_as_files(config.windows, clock, config.frames):
+        return run_program(config.file, arguments[end:])
+
+
+@contextmanager
+def lockstep_robot(scene: SceneConfig) -> Iterator[Clock]:
+    """Let the names mean a camera that makes its frames when they are waited for, in a scene that stands still."""
+    from sim_twin.clock import TwinClock
+    from sim_twin.realsense_source import TwinSource
+    from sim_twin.world import World
+
+    def refuse(config: Z1ArmConfig) -> Z1Arm:
+        raise CommandRefusedError("with --lockstep the twin's arm stands still; to move it leave that out.")
+
     world = World(scene)
-    clock: Clock = TwinClock(world) if config.lockstep else WallClock()
-    with TwinSource(world, clock) as source, windows_as_files(config.windows, clock, config.frames):
+    clock = TwinClock(world)
+    with ExitStack() as undo:
+        source = undo.enter_context(TwinSource(world, clock))
         source.warm_up()
-        with rs.plugged(source), rs.masquerade():
-            return run_program(config.file, arguments[end:])
+        undo.enter_context(_camera(source))
+        undo.enter_context(_arm(make_arm=refuse))
+        yield clock
+
+
+@contextmanager
+def wired_robot(scene: SceneConfig, start: Literal["home", "startFlat"]) -> Iterator[Clock]:
+    """Let the names mean an arm and a camera in a scene that lives by the wall's clock, in processes of its own."""
+    from hal.unitree_arm_interface import UDPPort
+    from scripts.run_wire import start_pose
+    from sim_twin.camera_process import RemoteSource
+    from sim_twin.wire_config import WireConfig
+    from sim_twin.wire_process import WireProcess
+    from sim_twin.wire_rig import free_ports
+
+    command_port, state_port = free_ports()
+    twin = WireProcess(scene, WireConfig(command_port=command_port, state_port=state_port), start_pose(start))
+    atexit.register(twin.close)  # a script's arm is let go of at exit, later registered and so before this
+    source = RemoteSource(twin)
+    source.warm_up()
+    with _camera(source), _arm(udp=UDPPort("127.0.0.1", command_port, state_port)):
+        yield source.clock
+
+
+@contextmanager
+def _camera(source: FrameSource) -> Iterator[None]:
+    import hal.realsense as rs
+
+    with rs.plugged(source), rs.masquerade():
+        yield
+
+
+@contextmanager
+def _arm(*, udp: UDPPort | None = None, make_arm: Callable[[Z1ArmConfig], Z1Arm] | None = None) -> Iterator[None]:
+    """Let `import unitree_arm_interface` give ours, its interfaces at the controller `udp`, or made by `make_arm`."""
+    import hal.unitree_arm_interface as vendor
+
+    interface = vendor.ArmInterface
+    before = interface.udp, interface.make_arm
+    interface.udp, interface.make_arm = udp or before[0], staticmethod(make_arm or before[1])
+    try:
+        with vendor.masquerade():
+            yield
+    finally:
+        interface.udp, interface.make_arm = before[0], staticmethod(before[1])
 
 
 def run_program(file: Path, arguments: list[str]) -> int:

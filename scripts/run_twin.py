@@ -1,7 +1,9 @@
 """The digital twin in place of a device, for programs that were written for the device.
 
-    ./z1 twin run-script [options] FILE.py [its own arguments]    a script for pyrealsense2 sees the twin's D405
-    ./z1 twin wire [options]                                      the twin's Z1 in place of `z1_ctrl` (or: twin --wire)
+    ./z1 twin run-script [options] FILE.py [its own arguments]    a script for pyrealsense2 sees the twin's D405, one
+                                                                  for unitree_arm_interface moves the twin's Z1
+    ./z1 twin wire [options]                                      the twin's Z1 in place of `z1_ctrl`, or of the arm's
+                                                                  board (or: twin --wire)
 
 `./z1 twin run-script --help` and `./z1 twin wire --help` tell the options.
 """

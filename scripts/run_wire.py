@@ -60,7 +60,7 @@ def main(arguments: list[str]) -> int:
 
     config = tyro.cli(Config, prog="z1 twin wire", description=__doc__, args=arguments)
     wire = config.wire
-    twin = WireProcess(make_scene(config), wire, start_pose(config))
+    twin = WireProcess(make_scene(config), wire, start_pose(config.start))
     stop_event = Event()
     stop_on_signals(stop_event)
     with ExitStack() as undo:
@@ -97,13 +97,13 @@ def make_scene(config: Config) -> SceneConfig:
     )
 
 
-def start_pose(config: Config) -> np.ndarray | None:
+def start_pose(start: Literal["startFlat", "home"]) -> np.ndarray | None:
     """Return where the arm starts, (7,) [rad]; None = at home."""
     import numpy as np
 
     from hal.wire.controller import LABELS
 
-    return np.append(LABELS["startFlat"], 0.0) if config.start == "startFlat" else None
+    return np.append(LABELS["startFlat"], 0.0) if start == "startFlat" else None
 
 
 def _show(twin: WireProcess, port: int, stop_event: Event) -> None:

@@ -124,20 +124,20 @@ class ArmInterface:
             HalError: the controller is silent, or does not follow.
             ValueError: a command is not of finite numbers in the right shape.
         """
-        arm, track = self._arm, self._track
+        arm, mode, track = self._arm, self._arm.mode, self._track
         arm.read_state()
         self.lowstate.take(arm.newest)
         try:
-            if arm.mode is Z1Mode.LOW_LEVEL:
+            if mode is Z1Mode.LOW_LEVEL:
                 arm.send_motors(self._motor_commands())
-            elif track is not None and arm.mode is Z1Mode.TRACKING:
+            elif track is not None and mode is Z1Mode.TRACKING:
                 if track is Fsm.CARTESIAN:
                     self._follow_rates(arm)
                 arm.send(ArmSetpoint(q=self._joined(self.q, self.gripperQ), dq=self._joined(self.qd, self.gripperQd)))
             else:
                 arm.idle()
         except CommandRefusedError:
-            if self._track is track:  # else the state was changed in between, by another thread
+            if self._track is track and arm.mode is mode and not arm.moving:  # else another thread changed it meanwhile
                 raise
 
     @staticmethod
@@ -191,7 +191,9 @@ class ArmInterface:
         return self._succeeds(change)
 
     def setFsmLowcmd(self) -> None:
-        """Go through PASSIVE to LOWCMD, where `q`, `qd`, `tau` and the gripper's start from the measurement."""
+        """Go through PASSIVE to LOWCMD, where `q`, `qd`, `tau` and the gripper's start from the measurement, and end
+        the loop: from now on `sendRecv` is the script's to call."""
+        self.loopOff()
         if self.setFsm(Fsm.PASSIVE):
             self.setFsm(Fsm.LOWCMD)
 

@@ -1,7 +1,8 @@
-"""Scripts written for pyrealsense2, in the idiom of librealsense's own examples, run unmodified on the twin."""
+"""Scripts written for pyrealsense2 and for the Z1's vendor module run unmodified on the twin."""
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from importlib.util import find_spec
@@ -12,10 +13,13 @@ import numpy as np
 import pytest
 
 from hal.clock import ManualClock
+from hal.wire.controller import LABELS
 from scripts.run_script import run_program
 from scripts.script_windows import Windows, windows_as_files
 
 SCRIPTS = Path(__file__).parent / "realsense_scripts"
+UNITREE_SCRIPTS = Path(__file__).parent / "unitree_scripts"
+FORWARD, START_FLAT = LABELS["forward"], LABELS["startFlat"]
 needs_librealsense = pytest.mark.skipif(find_spec("pyrealsense2") is None, reason="pyrealsense2 has no wheel here")
 
 
@@ -68,6 +72,53 @@ def test_a_script_filters_records_and_replays(tmp_path: Path) -> None:
     assert seen[3:] == ["played from Intel RealSense D405", "played True"]
     assert recording.stat().st_size > 1e6
     assert cloud.read_bytes().startswith(b"ply")
+
+
+@needs_librealsense
+def test_a_script_for_the_vendors_module_calculates(tmp_path: Path) -> None:
+    done = run_script(tmp_path, "--lockstep", str(UNITREE_SCRIPTS / "calculations.py"))
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines() == [
+        "any True True",
+        "far False",
+        "near True True",
+        "twist True",
+        "weight (6,) True",
+        "limits 6 6 6",
+        "protected True",
+        "singular True True",
+    ]
+
+
+@needs_librealsense
+def test_a_script_for_the_vendors_module_moves_the_arm_in_every_way(tmp_path: Path) -> None:
+    done = run_script(tmp_path, "--start=startFlat", str(UNITREE_SCRIPTS / "tour.py"))
+    assert done.returncode == 0, done.stderr
+    said = dict(re.split(r" (?=\[|True|False|[A-Z]{3}|\d)", line, maxsplit=1) for line in done.stdout.splitlines())
+    numbers = {name: np.fromstring(text.strip("[]"), sep=" ") for name, text in said.items() if text[0] == "["}
+    assert numbers["forward"] == pytest.approx(FORWARD, abs=0.03)
+    assert numbers["jogged"] == pytest.approx(FORWARD + 0.2 * np.eye(6)[0], abs=0.03)
+    assert numbers["jogged to"] == pytest.approx([*numbers["jogged"], -0.2], abs=0.05)
+    for name, y_m in (("MoveJ", -0.1), ("MoveL", 0.0), ("MoveC", 0.1)):
+        assert said[name] == "True"
+        assert numbers[f"{name} to"] == pytest.approx([0, 0, 0, 0.45, y_m, 0.35], abs=0.02)
+    assert said["unreachable"] == "False"
+    assert "no joints within the limits reach the posture" in done.stderr
+    assert (said["CARTESIAN"], said["down"]) == ("True", "True")
+    assert numbers["sideways"] == pytest.approx([0, 0], abs=0.005)
+    assert numbers["start"] == pytest.approx(START_FLAT, abs=0.03)
+    assert (said["passive"], said["low level"], said["end"]) == ("PASSIVE", "LOWCMD", "JOINTCTRL")
+    assert numbers["low level to"] == pytest.approx([0.2, 0.6, -0.6, -0.1, 0, 0], abs=0.06)
+    assert said["motors"] == "8 0 0"
+
+
+@needs_librealsense
+def test_in_lock_step_the_arm_stands_still_and_a_script_is_told_so(tmp_path: Path) -> None:
+    script = tmp_path / "moves.py"
+    script.write_text("import unitree_arm_interface as sdk\nsdk.ArmInterface(True).loopOn()\n")
+    done = run_script(tmp_path, "--lockstep", str(script))
+    assert done.returncode == 1
+    assert "with --lockstep the twin's arm stands still; to move it leave that out." in done.stderr
 
 
 def test_a_program_ends_here_as_it_would_alone(

@@ -15,6 +15,7 @@ import pytest
 
 from hal.wire.controller import LABELS, decode_state, encode_command
 from hal.wire.states import Fsm
+from scripts.rig_word import RigWord
 from scripts.run_demo import LIFTED_M
 from scripts.run_demo import Config as DemoConfig
 from scripts.run_wire import Config, make_scene, start_pose
@@ -52,7 +53,7 @@ def test_a_client_is_answered_until_somebody_ends_it(spelling: str) -> None:
 
 def test_the_folded_arm_rests_on_itself_in_passive() -> None:
     config = Config()
-    twin = make_twin(make_scene(config), config.wire, start_pose(config))
+    twin = make_twin(make_scene(config), config.wire, start_pose(config.start))
     twin.hear(encode_command(Fsm.INVALID))
     for _ in range(1000):
         twin.tick()
@@ -64,7 +65,7 @@ def test_the_folded_arm_rests_on_itself_in_passive() -> None:
 
 def test_home_is_where_the_camera_looks_from() -> None:
     config = Config(start="home", object="box")
-    twin = make_twin(make_scene(config), config.wire, start_pose(config))
+    twin = make_twin(make_scene(config), config.wire, start_pose(config.start))
     assert twin.world.read_arm()[0][1] == pytest.approx(1.085, abs=0.01)
 
 
@@ -108,5 +109,5 @@ def test_the_demo_lifts_the_bottle_through_both_real_drivers(tmp_path: Path) -> 
 
 
 def test_a_demo_through_the_wire_cannot_be_in_lockstep() -> None:
-    with pytest.raises(ValueError, match="leave out --hal wire-sim"):
-        DemoConfig(hal="wire-sim", lockstep=True)
+    with pytest.raises(ValueError, match="leave out --wire-sim"):
+        DemoConfig(rig=RigWord(wire_sim=True), lockstep=True)
