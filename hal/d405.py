@@ -27,6 +27,8 @@ EXPOSURE_US = (1, 165_000, 33_000)
 """Lowest, highest, default."""
 GAIN = (16, 248, 16)
 """Lowest, highest, default."""
+ASIC_C = 35.0
+"""A twin's; real ones are specified up to this around them, and make trouble from about 42 [°C]."""
 RESET_S = 2.0
 """About so long a hardware reset takes it off the bus."""
 

@@ -84,6 +84,7 @@ def _add_options(sensor) -> None:
         limits = rs.option_range()  # its constructor takes step and default the wrong way round
         limits.min, limits.max, limits.step, limits.default = lowest, highest, step, default
         sensor.add_option(option, limits, True)
+    sensor.add_read_only_option(rs.option.asic_temperature, d405.ASIC_C)
     sensor.add_read_only_option(rs.option.depth_units, d405.DEPTH_UNIT_M)
     sensor.add_read_only_option(rs.option.stereo_baseline, 1e3 * d405.BASELINE_M)  # librealsense: in millimetres
 

@@ -113,6 +113,16 @@ def test_it_has_one_sensor_and_no_projector(twin: rs.TwinDevice) -> None:
     assert text_of(lambda: rs.rs400_advanced_mode(device).is_enabled()) == 'null pointer passed for argument "dev"'
 
 
+def test_it_has_the_options_of_a_d405_with_their_ranges(twin: rs.TwinDevice) -> None:
+    sensor, option = twin.handle.first_depth_sensor(), rs.option
+    ranges = {key: sensor.get_option_range(key) for key in (option.exposure, option.gain, option.enable_auto_exposure)}
+    assert [(r.min, r.max, r.default) for r in ranges.values()] == [(1, 165_000, 33_000), (16, 248, 16), (0, 1, 1)]
+    assert text_of(lambda: sensor.set_option(option.gain, 999)) == 'out of range value for argument "value"'
+    assert sensor.get_option(option.frames_queue_size) == 16
+    assert 0 < sensor.get_option(option.asic_temperature) < 42
+    assert text_of(lambda: sensor.set_option(option.asic_temperature, 20)) == "This option is read-only!"
+
+
 def test_depth_comes_in_tenths_of_a_millimetre_over_a_baseline_of_18(twin: rs.TwinDevice) -> None:
     sensor = twin.handle.first_depth_sensor()
     assert sensor.get_depth_scale() == pytest.approx(1e-4)
