@@ -152,7 +152,7 @@ def _recordings_of_all(config: Config):
 
 def _run(tasks: list[Task], config: Config, store: Store, console: Console) -> None:
     tally: dict[str, list[int]] = {}
-    for row in store.rows(["method", "success"]):
+    for row in store.rows(["success"]):
         _count(tally, row)
     columns = (
         TextColumn("scenarios"),

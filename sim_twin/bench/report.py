@@ -31,7 +31,7 @@ _ALWAYS = ("object", "distance", "lateral", "pitch_deg")
 _STYLE = """:root{color-scheme:light}body{font:15px/1.55 system-ui,sans-serif;max-width:74rem;margin:0 auto;
 padding:2rem 1.5rem 4rem;color:#1a202c;background:#fff}h1{font-size:2rem;margin:0 0 .3rem}h1,h2,h3{line-height:1.2}
 h2{margin:2.8rem 0 .8rem;padding-bottom:.35rem;border-bottom:2px solid #e2e8f0}
-h3{margin:1.6rem 0 .4rem;font-size:1.02rem}figcaption,small{color:#4a5568}
+h3{margin:1.6rem 0 .4rem;font-size:1.02rem}figcaption,small{color:#4a5568;font-size:.86rem}
 figure{margin:.5rem 0;max-width:100%}svg{max-width:100%;height:auto;font-family:inherit}
 .row{display:flex;flex-wrap:wrap;gap:.5rem 2.5rem}.wide{overflow-x:auto}
 table{border-collapse:collapse;font-variant-numeric:tabular-nums}
@@ -145,16 +145,18 @@ def _knocked(own: Mapping[str, Sequence[Row]]) -> str:
 
 def _grids(own: Mapping[str, Sequence[Row]]) -> str:
     rows, columns = list(reversed(DISTANCES_M)), list(LATERALS_M)
-    plots = []
-    for name, part in own.items():
-        for reading, (flag, _) in tables.READINGS.items():
+    lines = []
+    for reading, (flag, _) in tables.READINGS.items():
+        plots = []
+        for name, part in own.items():
             cells = {
                 (r, c): _tally(part, flag, lambda row, r=r, c=c: (row["distance"], row["lateral"]) == (r, c))
                 for r in rows
                 for c in columns
             }
             plots.append(svg.rate_grid(rows, columns, cells, f"{name}, {reading}"))
-    return f"<p><small>As the robot sees it, from its base.</small></p><div class='row'>{''.join(plots)}</div>"
+        lines.append(f"<div class='row'>{''.join(plots)}</div>")
+    return f"<p><small>As the robot sees it, from its base.</small></p>{''.join(lines)}"
 
 
 def _modes(methods: Mapping[str, Any]) -> str:

@@ -39,7 +39,7 @@ class Store:
 
     def done(self) -> set[tuple[str, str]]:
         """Return which (scenario, method) pairs have a row."""
-        return {(row["scenario"], row["method"]) for row in self.rows(["scenario", "method"])}
+        return {(row["scenario"], row["method"]) for row in self.rows([])}
 
     def add(self, rows: Iterable[Row]) -> None:
         """Keep the rows of one scenario; on return they are on the disk."""
@@ -53,7 +53,13 @@ class Store:
         partial.replace(path)
 
     def rows(self, columns: list[str] | None = None) -> list[Row]:
-        """Return all rows, sorted by scenario and method; columns that a row lacks are None."""
+        """Return all rows, sorted by scenario and method; columns that a row lacks are None.
+
+        Args:
+            columns: what is wanted besides scenario and method; None is all.
+        """
+        if columns is not None:
+            columns = ["scenario", "method", *columns]
         tables = [pq.read_table(path, columns=columns) for path in sorted(self._folder.glob("*.parquet"))]
         if not tables:
             return []

@@ -42,6 +42,12 @@ def test_methods_added_later_stand_beside_the_earlier_ones(tmp_path):
     assert len(store.rows()) == 3
 
 
+def test_some_columns_can_be_had_alone(tmp_path):
+    store = Store(tmp_path, resume=False)
+    store.add(rows("a", slip_m=0.01))
+    assert store.rows(["success"])[0] == {"scenario": "a", "method": "mvb", "success": True}
+
+
 def test_the_table_holds_every_row(tmp_path):
     store = Store(tmp_path, resume=False)
     store.add(rows("a"))
