@@ -10,6 +10,8 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from threading import Event, Thread
 
+import numpy as np
+
 from hal.bus.server import HalServer
 from hal.bus.session import BusConfig
 from hal.errors import HalError
@@ -21,12 +23,13 @@ from hal.readonly import ReadonlyServo
 from hal.rig import Rig
 from hal.servo import Servo
 from hal.servo_thread import ServoThread, collect_garbage
-from hal.z1 import CONTROL_PERIOD_S
+from hal.z1 import CONTROL_PERIOD_S, N_ARM
 
 _LOG = logging.getLogger(__name__)
 HEARTBEAT_TIMEOUT_S = 0.15
 """How long the owner may be silent in motion [s]."""
 _BRAKING_S = 2.0
+_AT_REST_RAD_S = 0.01
 _LOOK_S = 0.05
 _COLLECT_EVERY = 1200  # looks: once a minute
 
@@ -171,9 +174,17 @@ class _Ending:
         self._servo.stop("the HAL process is ending")
         pause = Event()
         waited_s = 0.0
-        while self._ticking.alive and self._servo.status().mode is not ServoMode.STOPPED and waited_s < _BRAKING_S:
+        while self._ticking.alive and not self._rests() and waited_s < _BRAKING_S:
             pause.wait(_LOOK_S)
             waited_s += _LOOK_S
+
+    def _rests(self) -> bool:
+        """Whether the servo is stopped, and the arm with it, as far as it can be measured."""
+        try:
+            speed = np.abs(self._servo.read_state().dq[:N_ARM]).max()
+        except HalError:
+            speed = 0.0
+        return self._servo.status().mode is ServoMode.STOPPED and bool(speed < _AT_REST_RAD_S)
 
     def soften(self) -> None:
         """Let the motors of a parked arm go, if that is wanted; for when nothing ticks any more."""

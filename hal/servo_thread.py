@@ -141,7 +141,9 @@ def collect_garbage(servo: Servo) -> None:
 
 def _lock_memory() -> bool:
     # With a finite limit a later allocation would fail instead of being merely slow.
-    if resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] != resource.RLIM_INFINITY:
+    _, most = resource.getrlimit(resource.RLIMIT_MEMLOCK)
+    if most != resource.RLIM_INFINITY:
         return False
+    resource.setrlimit(resource.RLIMIT_MEMLOCK, (most, most))
     libc = ctypes.CDLL(None, use_errno=True)
     return libc.mlockall(_MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT) == 0

@@ -150,15 +150,24 @@ def _busy(beside: str, folder: Path) -> Iterator[Callable[[], int]]:
 
 
 def run_vision() -> None:
-    """Look for objects in one image after another, and write a byte to stdout for each."""
-    from hal.backends.replay_camera import ReplayCamera
-    from models.detector import YoloDetector
+    """Look for objects in a frame of the twin's, again and again, and write a byte to stdout each time: by the detector
+    that ships, else by what stands out of the table."""
+    from hal.z1 import Q_HOME, T_FLANGE_CAMERA
+    from models.weights_file import WeightsError
+    from sim_twin.backends import make_rig
+    from z1_runtime.detectors import make_detector
+    from z1_runtime.kinematics import Kinematics
 
-    detector, camera = YoloDetector(), ReplayCamera()
-    camera.connect()
-    image = camera.wait_for_frame(5.0).colour
+    try:
+        detector = make_detector("yolo")
+    except WeightsError as error:
+        print(f"{error} Vision is the table-top detector's for now.", file=sys.stderr)
+        detector = make_detector("tabletop")
+    rig = make_rig(lockstep=True)
+    rig.camera.connect()
+    frame, T_base_camera = rig.camera.wait_for_frame(1.0), Kinematics().flange(Q_HOME) @ T_FLANGE_CAMERA
     while True:
-        detector.detect(image)
+        detector.detect(frame, T_base_camera)
         sys.stdout.buffer.write(b".")
         sys.stdout.buffer.flush()
 
