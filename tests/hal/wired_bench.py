@@ -64,7 +64,7 @@ class WiredBench:
         self.twin_clock.call_every_tick(self.twin.tick)
         self.twin_clock.call_every_tick(self._note_torque)
         self.clock = JumpingClock(self.twin_clock)
-        self.link = MemoryLink(self.twin, self.clock)
+        self.link = MemoryLink(self.twin, self.clock, name="the twin")
         self.arm = Z1Arm(self.clock, Z1ArmConfig(mode=mode), link=self.link)
         self.servo = Servo(self.arm, self.clock, heartbeat_timeout_s=_HEARTBEAT_TIMEOUT_S)
         self.highest_torque = np.zeros(z1.N_JOINTS)

@@ -203,7 +203,8 @@ class Peer(Protocol):
 class MemoryLink:
     """The way to a controller within one process and one clock; `mangle` may do anything to what passes."""
 
-    def __init__(self, peer: Peer, clock: Clock, latency_s: float = 0.001) -> None:
+    def __init__(self, peer: Peer, clock: Clock, latency_s: float = 0.001, name: str = "the fake controller") -> None:
+        self.name = name
         self.peer = peer
         self.clock = clock
         self.latency_s = latency_s
@@ -235,7 +236,7 @@ class MemoryLink:
         return None
 
     def describe(self) -> str:
-        return "the fake controller"
+        return self.name
 
 
 @contextmanager
