@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -104,6 +104,17 @@ class RankedGrasps:
 
     def __len__(self) -> int:
         return len(self.indices)
+
+    def reordered(self, scores: np.ndarray) -> RankedGrasps:
+        """Return the same grasps ranked by other `scores` (M,), the greatest first; equal ones keep their order."""
+        order = np.argsort(-scores, kind="stable")
+        return replace(
+            self,
+            grasps=self.grasps[order],
+            indices=self.indices[order],
+            scores=scores[order],
+            alignments=self.alignments[order],
+        )
 
 
 def rank_grasps(

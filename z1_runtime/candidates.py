@@ -9,11 +9,11 @@ import numpy as np
 from models.types import GraspSet
 from z1_runtime.arm_collision import Problem
 from z1_runtime.collision import CollisionChecker
+from z1_runtime.fitting import fit_grasps, make_room
 from z1_runtime.gripper import BeakBatch, BeakGripper
 
 _CHUNK = 48
-_MAX_SHAPE_POINTS = 1500
-_PALM_HALF_WIDTH_M = 0.041
+_MAX_SHAPE_POINTS = 1000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -43,8 +43,19 @@ class Candidates:
         checker: CollisionChecker,
         *,
         fallback_width_m: float,
+        chunk: int = _CHUNK,
     ) -> None:
-        """Take `ranked` (camera frame); `fallback_width_m` stands for widths that nothing tells [m]."""
+        """Take `ranked` (camera frame).
+
+        Args:
+            ranked: in the order in which they are asked for.
+            T_base_camera: (4, 4).
+            gripper: what is laid around the object.
+            checker: what it may hit.
+            fallback_width_m: stands for widths that nothing tells [m].
+            chunk: how many are fitted at once; all of them, where all will be asked for.
+        """
+        self._chunk = max(1, chunk)
         self._gripper = gripper
         self._checker = checker
         self._fallback_width_m = fallback_width_m
@@ -53,15 +64,25 @@ class Candidates:
         self._shape_points = points[:: max(1, len(points) // _MAX_SHAPE_POINTS)]
         self.widths_m = np.array(ranked.widths_m, dtype=np.float64)
         """(N,) as given, or measured in the cloud once the candidate was fitted [m]."""
+        self.support = np.full(len(ranked), np.nan)
+        """(N,) share of the pads that the object fills, in [0, 1], once the candidate was fitted."""
+        self.level = np.full(len(ranked), np.nan)
+        """(N,) 1 where the jaws' push is level, 0 where friction just holds, once the candidate was fitted."""
         self._fronts_m = np.full(len(ranked), np.nan)
         self._chunks: dict[int, tuple[BeakBatch, list[list[Problem | None]]]] = {}
 
     def __len__(self) -> int:
         return len(self.widths_m)
 
+    @property
+    def contacts(self) -> np.ndarray:
+        """(N, 3) the middle between the contacts, in the base frame [m]."""
+        depth_m = self._gripper.config.contact_depth_m
+        return self._T_base_grasps[:, :3, 3] - depth_m * self._T_base_grasps[:, :3, 2]
+
     def jaw_contact(self, rank: int) -> float:
         """Return the mover angle at which candidate `rank` is touched [rad]."""
-        return float(self._chunks[rank // _CHUNK][0].jaw_contact[rank % _CHUNK])
+        return float(self._chunks[rank // self._chunk][0].jaw_contact[rank % self._chunk])
 
     def free(self) -> np.ndarray:
         """Return (N,) whether a flip of each candidate hits nothing at the grasp."""
@@ -69,10 +90,10 @@ class Candidates:
 
     def ways(self, rank: int) -> list[Way] | Problem:
         """Return the flips of candidate `rank` that hit nothing at the grasp, or why there is none."""
-        if rank // _CHUNK not in self._chunks:
-            self._fit_chunk(rank // _CHUNK)
-        batch, problems = self._chunks[rank // _CHUNK]
-        n = rank % _CHUNK
+        chunk, n = divmod(rank, self._chunk)
+        if chunk not in self._chunks:
+            self._fit_chunk(chunk)
+        batch, problems = self._chunks[chunk]
         under = [problem for problem in problems[n] if problem is not None and problem.reason == "table"]
         if len(under) == len(problems[n]):
             return under[0]
@@ -100,27 +121,45 @@ class Candidates:
         ]
 
     def _fit_chunk(self, chunk: int) -> None:
-        part = slice(chunk * _CHUNK, (chunk + 1) * _CHUNK)
-        T_base_grasps = self._T_base_grasps[part]
-        self._measure(part)
+        part = slice(chunk * self._chunk, (chunk + 1) * self._chunk)
+        T_base_grasps = self._measure(part)
         batch = self._gripper.fit_batch(T_base_grasps, self.widths_m[part], self._fronts_m[part])
+        self.level[part] = batch.level
         pivots, jaws = batch.T_base_pivots.reshape(-1, 4, 4), np.repeat(batch.jaw_open, 2)
         hits = self._checker.check_grippers(pivots, jaws)
         problems = [[hits.problem(2 * n + flip) for flip in range(2)] for n in range(len(T_base_grasps))]
         self._chunks[chunk] = batch, problems
 
-    def _measure(self, part: slice) -> None:
-        """Fill in widths nobody gave, and how far the object reaches towards the palm, from the object's points."""
-        depth_m = self._gripper.config.contact_depth_m
-        for rank in range(*part.indices(len(self.widths_m))):
-            T = self._T_base_grasps[rank]
-            x, y, z = ((self._shape_points - T[:3, 3]) @ T[:3, :3]).T
-            between = np.abs(x) < _PALM_HALF_WIDTH_M
-            if not np.isfinite(self.widths_m[rank]):
-                beside_pads = between & (np.abs(z + depth_m) < 0.025) & (np.abs(y) < 0.06)
-                seen_m = float(2.0 * np.abs(y[beside_pads]).max()) if beside_pads.any() else np.nan
-                self.widths_m[rank] = seen_m if np.isfinite(seen_m) else self._fallback_width_m
-            between &= np.abs(y) < 0.5 * self.widths_m[rank] + 0.005
-            # A percentile, not the nearest point: one speckle would push the whole hand back
-            front_m = -np.percentile(z[between], 1.0) - depth_m if between.any() else 0.0
-            self._fronts_m[rank] = max(front_m, 0.0)
+    def _measure(self, part: slice) -> np.ndarray:
+        """Fill in what the object's points say of the grasps in `part`; return them (n, 4, 4) with room for the rest
+        of the object where its sight was blocked."""
+        beak = self._gripper.config
+        fit = fit_grasps(
+            self._T_base_grasps[part], self.widths_m[part], self._shape_points, beak.contact_depth_m, beak.unseen_m
+        )
+        widths = np.where(np.isfinite(fit.widths_m), fit.widths_m, self._fallback_width_m)
+        self._fronts_m[part], self.support[part] = fit.fronts_m, fit.support
+        T_base_grasps = self._T_base_grasps[part].copy()
+        T_base_grasps[:, :3, 3] += fit.shifts_m[:, None] * T_base_grasps[:, :3, 1]
+        T_base_grasps, self.widths_m[part] = make_room(
+            T_base_grasps, widths, self._checker.hidden_points, beak.contact_depth_m
+        )
+        return self._deepened(T_base_grasps, part)
+
+    def _deepened(self, T_base_grasps: np.ndarray, part: slice) -> np.ndarray:
+        """Return the grasps moved on along their approach to where the object is as wide as it gets.
+
+        A round object reaches half its width towards the palm; where less of it is seen, the contacts lie before its
+        middle, and the jaws would push it out. The table bounds how far the jaws can go.
+        """
+        widths, fronts = self.widths_m[part], self._fronts_m[part]
+        batch = self._gripper.fit_batch(T_base_grasps, widths, fronts)
+        spare = self._checker.spare_height_m(batch.T_base_pivots.reshape(-1, 4, 4), np.repeat(batch.jaw_open, 2))
+        down = np.maximum(-T_base_grasps[:, :3, 2] @ self._checker.table.normal, 1e-3)
+        room = spare.reshape(-1, 2).max(axis=1) / down
+        most = np.minimum(self._gripper.config.max_deepening_m, np.maximum(room, 0.0))
+        deeper = np.clip(0.5 * widths - fronts, 0.0, most)
+        self._fronts_m[part] = fronts + deeper
+        moved = T_base_grasps.copy()
+        moved[:, :3, 3] += deeper[:, None] * T_base_grasps[:, :3, 2]
+        return moved

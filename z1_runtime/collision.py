@@ -96,22 +96,29 @@ class CollisionChecker:
         self,
         kinematics: Kinematics,
         observation: Observation,
-        q_frame: np.ndarray,
+        q_frame: np.ndarray | None,
         config: CollisionConfig | None = None,
     ) -> None:
-        """Index what `observation` saw; `q_frame` (7,) is where the arm was then [rad]."""
+        """Index what `observation` saw; `q_frame` (7,) is where the arm was then, if known [rad].
+
+        Perception takes the robot's own gripper off the scene; with `q_frame` what is left of it goes too.
+        """
         self.config = config or CollisionConfig()
         self._kinematics = kinematics
         self._shape = gripper_shape()
         T_base_camera = observation.T_base_camera
         self.table = plane_in_base(observation.table, T_base_camera)
         self.object_points = transform(T_base_camera, observation.object_points)
-        self.object_index = SceneIndex(self._down_to_table(self.object_points))
+        self.hidden_points = transform(T_base_camera, observation.hidden_points)
+        whole = np.concatenate([self._down_to_table(self.object_points), self.hidden_points])
+        self.object_index = SceneIndex(whole)
         scene = transform(T_base_camera, observation.scene_points)
         scene = scene[self.table.height_m(scene) > self.config.table_noise_m]
         scene = scene[~self.object_index.near(scene, self.config.object_halo_m)]
-        own = SceneIndex(self._gripper_points(q_frame))
-        self.scene_index = SceneIndex(scene[~own.near(scene, self.config.robot_halo_m)])
+        if q_frame is not None:
+            own = SceneIndex(self._gripper_points(q_frame))
+            scene = scene[~own.near(scene, self.config.robot_halo_m)]
+        self.scene_index = SceneIndex(scene)
 
     def _down_to_table(self, points: np.ndarray) -> np.ndarray:
         """Return the object's points and, where the picture cut it off above the table, what must be below them.
@@ -153,6 +160,11 @@ class CollisionChecker:
         scene = self._hits(self.scene_index, parts, scene_m)
         hit_object = self._hits(self.object_index, parts, object_m)
         return GripperHits(height, scene, hit_object, config.table_margin_m)
+
+    def spare_height_m(self, T_base_pivots: np.ndarray, jaws: np.ndarray) -> np.ndarray:
+        """Return how far (N,) the gripper could still go down at pivot poses (N, 4, 4) and mover angles (N,) [m]."""
+        parts = ((T_base_pivots, self._shape.fixed), (T_base_pivots @ mover_pose(jaws), self._shape.mover))
+        return np.min([self._lowest(T, vertices) for T, vertices in parts], axis=0) - self.config.table_margin_m
 
     def check_posture(self, q: np.ndarray) -> Problem | None:
         """Return what the arm at `q` (7,) hits: table or itself."""

@@ -57,7 +57,8 @@ class RuntimeConfig:
     k_faces: int = 2
     """How many faces nearest to the camera a grasp may approach (the paper's k)."""
     alpha: float = 0.85
-    """Weight of the alignment against the generator's score (the paper's α)."""
+    """Weight of the alignment against the generator's score (the paper's α), among grasps that are worth the same to
+    arm and gripper (`planner.ability`)."""
     speed: float = 0.5
     """Fraction of the arm's speed, acceleration and jerk limits that motions use, in (0, 1]."""
     jaw_home: float = -1.0

@@ -49,7 +49,7 @@ class Decision:
     ranked: RankedGrasps
     plan: GraspPlan
     stage_ms: dict[str, float]
-    """By stage: detect, cloud, generate, mvbb, ik, collision, plan, and their total."""
+    """By stage: detect, cloud, generate, mvbb, rank, ik, collision, plan, and their total."""
 
 
 class Decider:
@@ -104,7 +104,9 @@ class Decider:
         with times.stage("generate"):
             candidates = self.propose(observation)
         with times.stage("mvbb"):
-            ranked = self.rank(candidates, observation)
+            ranked = self._chosen_by_box(candidates, observation)
+        with times.stage("rank"):
+            ranked = self._by_ability(ranked, observation)
         return candidates, ranked, self.planner.plan(ranked.grasps, observation, q, times.stage)
 
     def observe(self, frame: RgbdFrame, q: np.ndarray, times: StageTimes | None = None) -> Observation:
@@ -132,10 +134,15 @@ class Decider:
     def rank(self, candidates: GraspSet, observation: Observation) -> RankedGrasps:
         """Return the candidates that come at one of the nearest faces of the object's box, best first.
 
+        The box chooses, as in the paper; among those it lets pass the order is by what arm and gripper can do.
+
         Raises:
             DegenerateCloudError: the object's cloud spans no box.
             NoPlanError: none does.
         """
+        return self._by_ability(self._chosen_by_box(candidates, observation), observation)
+
+    def _chosen_by_box(self, candidates: GraspSet, observation: Observation) -> RankedGrasps:
         config = self.config
         up = observation.T_base_camera[2, :3]  # the base's z axis, seen from the camera
         box = fit_obb(observation.object_points, config.box_method, up=up)
@@ -147,6 +154,11 @@ class Decider:
                 rejections=(),
             )
         return ranked
+
+    def _by_ability(self, ranked: RankedGrasps, observation: Observation) -> RankedGrasps:
+        assert ranked.box is not None
+        middle = ranked.box.T_camera_box[:3, 3]
+        return ranked.reordered(self.planner.ability(ranked.grasps, observation, middle, ranked.alignments))
 
     def warm_up(self) -> None:
         """Decide once on a drawn scene, so that the first real frame does not wait for compilers and caches."""

@@ -66,6 +66,7 @@ class MotionPlanner:
         self._q_start = q_start
         self._config = config
         self._limits = limits
+        self._closing = limits.hastened(config.closing_haste)
         self._timer = timer
 
     def first_motion(self, ways: list[Way]) -> tuple[Way, Motion]:
@@ -133,10 +134,10 @@ class MotionPlanner:
         try:
             approach = straight_move(self._kinematics, T_pre, way.T_base_pivot, q_pre, way.jaw_open, limits)
             touch = straight_move(
-                self._kinematics, way.T_base_pivot, way.T_base_touch, approach.q[-1], way.jaw_touch, limits
+                self._kinematics, way.T_base_pivot, way.T_base_touch, approach.q[-1], way.jaw_touch, self._closing
             )
             # The servo bounds the torque, so "closed" is where the jaws are sent, not where they end.
-            close = concatenate([touch, gripper_move(touch.q[-1], z1.GRIPPER_CLOSED, limits)])
+            close = concatenate([touch, gripper_move(touch.q[-1], z1.GRIPPER_CLOSED, self._closing)])
             lift = straight_move(self._kinematics, way.T_base_touch, T_lifted, close.q[-1], z1.GRIPPER_CLOSED, limits)
         except PathFailure as failure:
             raise Refused("path", str(failure)) from failure

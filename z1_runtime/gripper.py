@@ -56,12 +56,19 @@ class BeakConfig:
     """How far the knees go beyond the contact axis along the approach; a little beyond pulls the object in [m]."""
     max_setback_m: float = 0.025
     """How far before the asked contacts an object that reaches deep into the hand may be held instead [m]."""
+    unseen_m: float = 0.004
+    """How much farther out than said a contact is thought to be that the camera does not see: generators take what
+    they cannot see for less than it is [m]."""
+    max_deepening_m: float = 0.010
+    """How far beyond the asked contacts an object is held that reaches less far towards the palm than a round one of
+    its width: it is wider there [m]."""
     palm_clearance_m: float = 0.005
     """Free space between the palm and the object [m]."""
     clearance_m: float = 0.0095
     """Gap between each jaw and the object while approaching; opening wider makes tilted objects collide [m]."""
-    squeeze_m: float = 0.004
-    """How much narrower than the object the gap is where the hand stops turning; the jaw closes on from there [m]."""
+    squeeze_m: float = 0.016
+    """How much narrower than the object the gap is where the hand stops turning; the jaw closes on from there. So the
+    jaws are at their fastest when they touch, and an error of the middle costs least time between the two [m]."""
     friction: float = 0.4
     """Least friction coefficient that must keep the object from being squeezed out; rubber on plastic has 0.5 to 1."""
 
@@ -100,6 +107,8 @@ class BeakBatch:
     """(N, 2, 4, 4) pivot poses once both jaws press."""
     jaw_touch: np.ndarray
     """(N,) [rad]."""
+    level: np.ndarray
+    """(N,) 1 where the squeeze does not push the object out, 0 where friction only just holds it."""
     fits: np.ndarray
     """(N,) False where the width is refused; the other rows of such a grasp mean nothing."""
 
@@ -183,6 +192,7 @@ class BeakGripper:
             jaw_open=np.maximum(-lay.opened, z1.GRIPPER_OPEN),
             T_base_touches=T_base_pivots @ mover_pose(-lay.turn)[:, None],
             jaw_touch=-lay.pressed,
+            level=np.clip(1.0 - lay.squeeze_out / self._steepest, 0.0, 1.0),
             fits=usable & self._fits(lay),
         )
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -60,6 +60,22 @@ class MotionLimits:
             for name in (f"{kind}_velocity", f"{kind}_acceleration", f"{kind}_jerk"):
                 if not 0.0 < getattr(self, name) < np.inf:
                     raise ValueError(f"{name} is {getattr(self, name)}; it must be positive and finite.")
+
+    def hastened(self, factor: float) -> MotionLimits:
+        """Return limits `factor` times as high, where the arm's own do not end that.
+
+        Raises:
+            ValueError: `factor` is not positive and finite.
+        """
+        if not 0.0 < factor < np.inf:
+            raise ValueError(f"factor is {factor}; it must be positive and finite.")
+        changes: dict[str, np.ndarray | float] = {}
+        names, joints = ("velocity", "acceleration", "jerk"), (z1.DQ_MAX, z1.DDQ_MAX, z1.DDDQ_MAX)
+        for name, joint, linear, angular in zip(names, joints, _FULL_LINEAR, _FULL_ANGULAR, strict=True):
+            changes[name] = np.minimum(factor * getattr(self, name), joint)
+            changes[f"linear_{name}"] = min(factor * getattr(self, f"linear_{name}"), linear)
+            changes[f"angular_{name}"] = min(factor * getattr(self, f"angular_{name}"), angular)
+        return replace(self, **changes)  # pyright: ignore[reportArgumentType]
 
     @classmethod
     def at_speed(cls, speed: float) -> MotionLimits:

@@ -25,6 +25,7 @@ from z1_runtime.cloud import (
     voxel_downsample,
 )
 from z1_runtime.detectors import Detector
+from z1_runtime.hidden import hidden_points
 from z1_runtime.own_gripper import OwnGripper
 from z1_runtime.table import TableConfig, expected_table, fit_table
 from z1_runtime.types import Observation
@@ -175,6 +176,8 @@ class Perception:
         above = table.above(points, config.min_height_m)
 
         candidate = crop[seen]
+        solid = np.zeros(depth.shape, bool)
+        solid[seen] = candidate & above & continuous[seen]
         object_points = self._clean(points[candidate], above[candidate], continuous[seen][candidate])
         return Observation(
             frame=frame,
@@ -184,6 +187,7 @@ class Perception:
             # The table under a box-shaped crop is scene; what stands inside the crop is not.
             scene_points=points[continuous[seen] & ~(rim[seen] & above)],
             table=table.plane,
+            hidden_points=hidden_points(depth, frame.intrinsics, solid),
         )
 
     def _without_gripper(self, frame: RgbdFrame, jaw: float) -> RgbdFrame:

@@ -15,8 +15,11 @@ import numpy as np
 
 from hal import z1
 from models.types import GraspSet
+from z1_runtime import fitting
+from z1_runtime.ability import AbilityRanking
 from z1_runtime.arm_collision import Problem
 from z1_runtime.candidates import Candidates, Way
+from z1_runtime.cloud import transform
 from z1_runtime.collision import CollisionChecker, warm_up
 from z1_runtime.grasp_motion import Motion, MotionPlanner, Refused, StageTimer
 from z1_runtime.gripper import BeakGripper
@@ -57,6 +60,26 @@ class GraspPlanner:
         self._kinematics = kinematics
         self._limits = limits or MotionLimits()
         warm_up()
+        fitting.warm_up()
+
+    def ability(
+        self, grasps: GraspSet, observation: Observation, middle: np.ndarray, alignments: np.ndarray
+    ) -> np.ndarray:
+        """Return what each of `grasps` (camera frame) is worth to this arm and gripper, (N,): the more the better.
+
+        Args:
+            grasps: with the generator's scores.
+            observation: the frame they were made from.
+            middle: (3,) of the object, camera frame [m].
+            alignments: (N,) with a face of the object's box, in [0, 1].
+        """
+        config, T_base_camera = self.config, observation.T_base_camera
+        checker = CollisionChecker(self._kinematics, observation, None, config.collision)
+        candidates = Candidates(
+            grasps, T_base_camera, self.gripper, checker, fallback_width_m=config.fallback_width_m, chunk=len(grasps)
+        )
+        ranking = AbilityRanking(self._kinematics, checker, candidates, config)
+        return ranking.scores(transform(T_base_camera, middle), grasps.scores, alignments)
 
     def plan(
         self, ranked: GraspSet, observation: Observation, q_start: np.ndarray, timer: StageTimer | None = None

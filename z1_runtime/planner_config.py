@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from z1_runtime.ability_config import AbilityConfig
 from z1_runtime.collision import CollisionConfig
 from z1_runtime.gripper import BeakConfig
 
@@ -18,6 +19,8 @@ class PlannerConfig:
     """Tried where the arm cannot draw back that far [m]."""
     lift_m: float = 0.10
     """Straight up after closing [m]."""
+    closing_haste: float = 2.0
+    """How much faster than the rest of the motion the jaws close: what leans falls while only one jaw touches it."""
     fallback_width_m: float = 0.06
     """Taken where neither the generator nor the cloud tells a width [m]."""
     max_tried: int = 60
@@ -29,6 +32,10 @@ class PlannerConfig:
     """Joint solutions tried per pre-grasp, nearest to home first."""
     raise_m: float = 0.12
     """How far above the pre-grasp the detour leads, when the direct way is blocked [m]."""
+    max_swing_rad: float = 1.2
+    """A joint that turns further than this between pre-grasp and grasp, or grasp and lift, has changed its branch."""
+    ability: AbilityConfig = field(default_factory=AbilityConfig)
+    """What makes one grasp better than another for this arm and gripper."""
     beak: BeakConfig = field(default_factory=BeakConfig)
     """How the beak is laid around an object."""
     collision: CollisionConfig = field(default_factory=CollisionConfig)
@@ -40,6 +47,8 @@ class PlannerConfig:
                 "PlannerConfig wants 0 < short_standoff_m <= standoff_m, lift_m > 0 and max_tried >= 1; got "
                 f"{self.short_standoff_m}, {self.standoff_m}, {self.lift_m} and {self.max_tried}."
             )
+        if not 1.0 <= self.closing_haste <= 10.0:
+            raise ValueError(f"closing_haste is {self.closing_haste}; allowed is 1 to 10.")
         for name in ("max_least_squares", "max_branches", "raise_m", "fallback_width_m"):
             least = 1 if name == "max_branches" else 0
             if not least <= getattr(self, name) < float("inf"):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -43,6 +43,8 @@ class Observation:
     scene_points: np.ndarray
     """(M, 3) everything else that was seen: the table, neighbours, walls; not the object."""
     table: Plane
+    hidden_points: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
+    """(K, 3) where the object may go on, but its sight was blocked; see `z1_runtime.hidden`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

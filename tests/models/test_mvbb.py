@@ -295,6 +295,18 @@ def test_alpha_one_ranks_by_alignment_and_alpha_zero_by_score():
     assert (np.diff(by_score.grasps.scores) <= 0).all()
 
 
+def test_a_ranking_by_other_scores_keeps_what_belongs_together():
+    ranked = rank_grasps(make_random_grasps(np.random.default_rng(7)), make_box())
+    other = np.random.default_rng(8).random(len(ranked))
+    again = ranked.reordered(other)
+    assert (np.diff(again.scores) <= 0).all() and sorted(again.indices) == sorted(ranked.indices)
+    place = {index: n for n, index in enumerate(ranked.indices)}
+    order = [place[index] for index in again.indices]
+    np.testing.assert_array_equal(again.scores, other[order])
+    np.testing.assert_array_equal(again.alignments, ranked.alignments[order])
+    np.testing.assert_array_equal(again.grasps.T_camera_grasps, ranked.grasps.T_camera_grasps[order])
+
+
 def test_no_survivor_gives_an_empty_ranking():
     away = make_grasps(np.array([[0.0, 0.0, -1.0], [0.0, 0.1, -1.0]]), np.array([0.1, 0.9]))
     ranked = rank_grasps(away, make_box(), k=1)

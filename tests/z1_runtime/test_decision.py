@@ -72,7 +72,7 @@ def test_a_can_is_grasped_where_it_stands_by_a_plan_that_starts_at_the_arm(decis
 
 
 def test_every_stage_is_timed_and_the_total_holds_them_all(decision):
-    assert set(decision.stage_ms) == {"detect", "cloud", "generate", "mvbb", "ik", "collision", "plan", "total"}
+    assert set(decision.stage_ms) == {"detect", "cloud", "generate", "mvbb", "rank", "ik", "collision", "plan", "total"}
     parts = sum(ms for name, ms in decision.stage_ms.items() if name != "total")
     assert 0.0 < parts <= decision.stage_ms["total"]
 
@@ -81,7 +81,9 @@ def test_the_box_chooses_among_the_candidates_as_the_configuration_says(decider,
     assert len(decision.candidates) == CONFIG.n_candidates
     box = fit_obb(decision.observation.object_points, CONFIG.box_method, up=T_base_camera[2, :3])
     by_hand = rank_grasps(decision.candidates, box, k=CONFIG.k_faces, alpha=CONFIG.alpha)
-    assert decision.ranked.indices.tolist() == by_hand.indices.tolist()
+    assert sorted(decision.ranked.indices) == sorted(by_hand.indices)
+    assert (np.diff(decision.ranked.scores) <= 0.0).all()
+    assert decision.plan.rank == 0
     assert 0 < len(decision.ranked) < len(decision.candidates)
     one_face = with_part(decider, config=replace(CONFIG, k_faces=1)).decide(draw_can(T_base_camera), Q)
     assert len(one_face.ranked) < len(decision.ranked)
