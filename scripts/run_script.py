@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Literal
 import tyro
 
 from hal.clock import Clock
-from hal.errors import CommandRefusedError
+from hal.errors import CommandRefusedError, SdkMissingError
 from scripts.script_windows import windows_as_files
 
 if TYPE_CHECKING:
@@ -112,9 +112,15 @@ def wired_robot(scene: SceneConfig, start: Literal["home", "startFlat"]) -> Iter
     command_port, state_port = free_ports()
     twin = WireProcess(scene, WireConfig(command_port=command_port, state_port=state_port), start_pose(start))
     atexit.register(twin.close)  # a script's arm is let go of at exit, later registered and so before this
-    source = RemoteSource(twin)
-    source.warm_up()
-    with _camera(source), _arm(udp=UDPPort("127.0.0.1", command_port, state_port)):
+    twin.start()
+    with ExitStack() as undo:
+        source = RemoteSource(twin)
+        try:
+            undo.enter_context(_camera(source))
+            source.warm_up()
+        except SdkMissingError as missing:  # a script that moves the arm alone does not need it
+            print(f"no camera: {missing}", file=sys.stderr)
+        undo.enter_context(_arm(udp=UDPPort("127.0.0.1", command_port, state_port)))
         yield source.clock
 
 

@@ -77,7 +77,7 @@ class Motors:
             self._told, self._unheard_s[:] = commands, 0.0
             self._drive(commands)
             return
-        heard = self._working(errors=False).any(axis=1)
+        heard = np.any(self._working(errors=False), axis=1)
         heard[len(commands.q) :] = False
         told = {name: getattr(self._told, name).copy() for name in _FIELDS}
         for name, values in told.items():

@@ -90,6 +90,7 @@ def test_a_script_for_the_vendors_module_calculates(tmp_path: Path) -> None:
     ]
 
 
+@pytest.mark.slow
 @needs_librealsense
 def test_a_script_for_the_vendors_module_moves_the_arm_in_every_way(tmp_path: Path) -> None:
     done = run_script(tmp_path, "--start=startFlat", str(UNITREE_SCRIPTS / "tour.py"))
