@@ -16,6 +16,7 @@ from hal.backends.z1_arm import Z1Arm
 from hal.backends.z1_config import Z1ArmConfig, Z1Mode
 from hal.clock import WallClock
 from hal.errors import CommandRefusedError, HalTimeoutError, LeaseError
+from hal.guard import Guard
 from hal.messages import ServoMode, TrajectoryChunk
 from hal.rig import RIGS
 from hal.servo import Servo
@@ -131,4 +132,8 @@ def test_the_real_rig_is_known_by_its_name() -> None:
     rig = RIGS.make("real", arm=Z1ArmConfig(connect_timeout_s=1.0), scene=None)
     assert isinstance(rig.arm, Z1Arm)
     assert rig.arm.config.connect_timeout_s == 1.0
+    assert rig.independent
+    assert rig.park is not None
+    assert rig.park.soften == rig.arm.go_passive
+    assert Guard().refusal(np.append(rig.park.q, 0.0)[None], np.append(z1.Q_HOME, 0.0)) is None
     assert rig.call_every_tick is None
