@@ -147,7 +147,7 @@ def _assemble(path: Path, hulls: list[np.ndarray], mass_kg: float) -> GraspObjec
         )
         for body in bodies
     )
-    centre = sum(body.volume * _centroid(body) for body in bodies) / total
+    centre = np.sum([body.volume * _centroid(body) for body in bodies], axis=0) / total
     return GraspObject(height_m=float(np.ptp(corners[:, 2])), parts=parts, stands=_stands(parts, centre))
 
 

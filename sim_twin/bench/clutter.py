@@ -33,7 +33,7 @@ def draw_neighbours(scene: SceneConfig, count: int, names: Sequence[str], seed: 
         RuntimeError: no room was found.
     """
     rng = np.random.default_rng([seed, 0xC1])
-    order = [names[k % len(names)] for k in rng.permutation(max(count, len(names)))]
+    order = [names[int(k) % len(names)] for k in rng.permutation(max(count, len(names)))]
     pose = scene.T_base_object()
     middle, radius_m = pose[:2, 3], _radius_m(scene.thing.corners() @ pose[:3, :3].T)
     standing: list[tuple[np.ndarray, float]] = []
