@@ -65,7 +65,7 @@ def main(config: Config) -> int:
         with console.status("loading the planner (some seconds)"):
             pipeline = _assemble(config, arm, camera, console, undo)
         arm.claim("run")  # given back by disconnecting, which forgives a HAL that is gone
-        record = pipeline.pick()
+        record = pipeline.pick_until_held()
     console.print("the jaws hold something" if record.held else "the jaws are empty")
     return 0 if record.held else 1
 

@@ -69,6 +69,8 @@ class RuntimeConfig:
     """A gripper torque below this holds nothing [Nm]."""
     hold_s: float = 1.0
     """How long the lifted object is held before it counts [s]."""
+    attempts: int = 2
+    """How often to pick while the jaws end up empty, each time from the scene as it then is."""
     frame_timeout_s: float = 5.0
     """How long to wait for a camera frame [s]."""
     perception: PerceptionConfig = field(default_factory=PerceptionConfig)
@@ -99,6 +101,7 @@ class RuntimeConfig:
         _require(-1.5707 <= self.jaw_empty <= 0.0, "jaw_empty", self.jaw_empty, "-1.5707 to 0 rad")
         _require(0.0 <= self.held_torque_nm < 30.0, "held_torque_nm", self.held_torque_nm, "0 to 30 Nm")
         _require(0.0 <= self.hold_s <= 60.0, "hold_s", self.hold_s, "0 to 60 s")
+        _require(1 <= self.attempts <= 20, "attempts", self.attempts, "1 to 20")
         _require(0.0 < self.frame_timeout_s <= 60.0, "frame_timeout_s", self.frame_timeout_s, "above 0, up to 60 s")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -14,12 +15,17 @@ from hal.arm import ServoedArm
 from hal.camera import Camera
 from hal.clock import Clock
 from hal.messages import ArmState
+from models.obb import DegenerateCloudError
+from z1_runtime.cloud import PerceptionError
 from z1_runtime.config import RuntimeConfig
 from z1_runtime.decision import Decider, Decision
 from z1_runtime.executor import Executor
 from z1_runtime.inspect import Inspector
+from z1_runtime.planner import NoPlanError
 from z1_runtime.trajectory import MotionLimits, hold, joint_move
 from z1_runtime.types import GraspPlan
+
+_LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -110,6 +116,26 @@ class PickPipeline:
             jaw=jaw,
             jaw_torque_nm=torque,
         )
+
+    def pick_until_held(self) -> PickRecord:
+        """Pick, and while the jaws hold nothing pick again from the scene as it then is, `attempts` times in all.
+
+        Returns the last pick that was executed: what a miss has pushed out of view or out of reach ends it too.
+
+        Raises:
+            As `pick`, for the first attempt; later ones only what the arm or the HAL say.
+        """
+        record = self.pick()
+        for attempt in range(2, self.config.attempts + 1):
+            if record.held:
+                break
+            _LOG.info("the jaws closed on nothing; attempt %d of %d", attempt, self.config.attempts)
+            try:
+                record = self.pick()
+            except (PerceptionError, DegenerateCloudError, NoPlanError) as error:
+                _LOG.warning("no further attempt: %s", error)
+                break
+        return record
 
     def _go_home(self) -> None:
         q = np.clip(self.arm.status().q_command, z1.Q_MIN, z1.Q_MAX)

@@ -112,6 +112,34 @@ def test_the_arm_goes_home_first_and_a_second_pick_starts_from_where_the_first_e
     assert second.decision.plan.rank == first.decision.plan.rank
 
 
+def test_a_miss_is_followed_by_another_look_and_another_pick_up_to_the_attempts(decider, can):
+    cell = Cell(decider, can)
+    record = cell.pipeline.pick_until_held()
+    assert not record.held
+    assert cell.ended == PHASES * CONFIG.attempts
+
+
+def test_a_pick_that_holds_is_not_repeated(decider, can):
+    cell = Cell(decider, can)
+    cell.after = lambda name: cell.bench.mock.block(z1.N_ARM) if name == "approach" else None
+    assert cell.pipeline.pick_until_held().held
+    assert cell.ended == PHASES
+
+
+def test_an_object_that_a_miss_pushed_away_ends_the_attempts(decider, can):
+    cell = Cell(decider, can)
+    empty = replace(can, depth_m=np.where(can.depth_m < 0.45, 0.0, can.depth_m))
+
+    def clear_the_table(name: str) -> None:
+        if name == "lift":
+            cell.pipeline.camera = ReplayCamera([empty], clock=cell.bench.clock)
+            cell.pipeline.camera.connect()
+
+    cell.after = clear_the_table
+    assert not cell.pipeline.pick_until_held().held
+    assert cell.ended == [*PHASES, "home", "look"]
+
+
 def nothing_moved(cell: Cell) -> bool:
     cell.bench.wait(0.5)
     return bool(np.abs(cell.q - Q_LOOK).max() < 1e-3) and cell.bench.servo.status().trajectory_id == 0
