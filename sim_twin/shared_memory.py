@@ -70,7 +70,7 @@ class SharedWorld:
 
     def publish(self, time_s: float, qpos: np.ndarray) -> None:
         """Write MuJoCo's time [s] and positions (nq,), at most 512."""
-        self._version += 1  # odd while it is written
+        self._version |= 1  # odd while it is written; and it is already if the publisher before died writing
         self._time_s[...] = time_s
         self._nq[...] = len(qpos)
         self._qpos[: len(qpos)] = qpos

@@ -70,6 +70,9 @@ def test_what_is_published_is_read_and_what_is_half_written_is_not() -> None:
     here._version += 1  # as if it had died while it wrote
     with pytest.raises(RuntimeError, match="ended while it wrote"):
         there.read()
+    here.publish(2.5, np.ones(7))  # by whoever takes its place
+    assert there.read()[0] == 2.5
+    assert there.read()[1] == pytest.approx(np.ones(7))
     os.close(fd)
 
 
