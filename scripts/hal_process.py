@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
@@ -29,8 +29,11 @@ class HalProcess:
     """
 
     def __init__(self, scene: SceneConfig, bus: BusConfig, log: Path, hal: str = "sim") -> None:
-        options = {**asdict(scene), **asdict(bus)}
-        del options["noise"], options["board"]  # a served camera always has its noise; no demo has a board
+        # What is as it always is stays unsaid: a served scene has fewer options than a benchmark's.
+        changed = {f.name: value for f in fields(scene) if (value := getattr(scene, f.name)) != f.default}
+        options = {**changed, **asdict(bus)}
+        for name in ("noise", "board"):  # a served camera always has its noise; no demo has a board
+            options.pop(name, None)
         arguments = [_option(name, value) for name, value in options.items()]
         self._log, self._ready = log, False
         with log.open("wb") as stderr:
