@@ -79,7 +79,7 @@ class GraspPlanner:
             grasps, T_base_camera, self.gripper, checker, fallback_width_m=config.fallback_width_m, chunk=len(grasps)
         )
         ranking = AbilityRanking(self._kinematics, checker, candidates, config)
-        return ranking.scores(transform(T_base_camera, middle), grasps.scores, alignments)
+        return ranking.scores(_standing(transform(T_base_camera, middle), checker), grasps.scores, alignments)
 
     def plan(
         self, ranked: GraspSet, observation: Observation, q_start: np.ndarray, timer: StageTimer | None = None
@@ -169,6 +169,12 @@ class GraspPlanner:
                 del refused[rank]
                 return _Found(rank=rank, way=near, motion=motion, ik_method="least_squares")
         return None
+
+
+def _standing(middle: np.ndarray, checker: CollisionChecker) -> np.ndarray:
+    """Return the middle (3,) of the object at half its height: of what leans to the camera only the top is seen."""
+    top_m = float(np.percentile(checker.table.height_m(checker.object_points), 99.0))
+    return middle + (0.5 * top_m - checker.table.height_m(middle)) * checker.table.normal
 
 
 def _explain(n: int, rejections: tuple[Rejection, ...]) -> str:
