@@ -48,8 +48,8 @@ def fit_grasps(
         contact_depth_m: how far the grasps' origins lie beyond their contacts [m].
         unseen_m: how much farther out a contact is thought to be where no point is seen near it [m].
     """
-    arrays = (np.ascontiguousarray(array, dtype=np.float64) for array in (T_base_grasps, widths_m, points))
-    return Fit(*_fit(*arrays, contact_depth_m, unseen_m))
+    T, widths, cloud = (np.ascontiguousarray(array, dtype=np.float64) for array in (T_base_grasps, widths_m, points))
+    return Fit(*_fit(T, widths, cloud, contact_depth_m, unseen_m))
 
 
 def make_room(
@@ -61,8 +61,8 @@ def make_room(
     """
     low, high = -0.5 * widths_m, 0.5 * widths_m
     if len(hidden):
-        arrays = (np.ascontiguousarray(array, dtype=np.float64) for array in (T_base_grasps, widths_m, hidden))
-        below, above = _reach_aside(*arrays, contact_depth_m)
+        T, widths, cloud = (np.ascontiguousarray(array, np.float64) for array in (T_base_grasps, widths_m, hidden))
+        below, above = _reach_aside(T, widths, cloud, contact_depth_m)
         low, high = np.fmin(low, below), np.fmax(high, above)
     moved = T_base_grasps.copy()
     moved[:, :3, 3] += (0.5 * np.nan_to_num(low + high))[:, None] * T_base_grasps[:, :3, 1]

@@ -31,6 +31,7 @@ def hidden_points(depth_m: np.ndarray, intrinsics: Intrinsics, solid: np.ndarray
     away, label = cv2.distanceTransformWithLabels(
         (~solid).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
     )
+    label = np.asarray(label, dtype=np.intp)
     reach_px = REACH_M * intrinsics.fx / float(np.median(depth_m[solid]))
     near = (gaps > 0) & (away < reach_px)
     # Only where the gap begins at the object itself: one that the table separates from it hides no more of it
