@@ -39,8 +39,9 @@ class Phase:
 
 PHASES = (
     Phase(imgsz=256, epochs=12, lr0=2.0e-3, lrf=0.7, warmup_epochs=1.0, batch=16),
-    Phase(imgsz=384, epochs=8, lr0=1.4e-3, lrf=0.25, warmup_epochs=0.2, batch=16),
-    Phase(imgsz=512, epochs=2, lr0=3.5e-4, lrf=0.05, warmup_epochs=0.1, batch=16),
+    Phase(imgsz=256, epochs=5, lr0=1.4e-3, lrf=0.9, warmup_epochs=0.2, batch=16),
+    Phase(imgsz=256, epochs=9, lr0=1.3e-3, lrf=0.25, warmup_epochs=0.2, batch=16),
+    Phase(imgsz=384, epochs=3, lr0=3.5e-4, lrf=0.1, warmup_epochs=0.1, batch=16),
 )
 """Small pictures teach most of it at a fraction of the time; the last have the size at which the network is used."""
 

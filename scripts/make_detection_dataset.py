@@ -12,7 +12,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -26,6 +26,9 @@ from sim_twin.detection_scenes import Label, Picture, SceneMix
 
 SPLITS = {"train": 1_000_000, "val": 2_000_000, "empty": 3_000_000}
 """Name to the first seed: no two splits share a seed, so neither props, textures nor lights."""
+
+_CHANGES = {"train": {"crowd": 0.75}, "empty": {"empty": 1.0}}
+"""In what the splits differ from the mix."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,7 +86,7 @@ def plan_shards(config: Config) -> list[Shard]:
     """Return every shard that `config` asks for, those that exist included."""
     shards = []
     for split, start in SPLITS.items():
-        mix = SceneMix(**{**asdict(config.mix), "empty": 1.0}) if split == "empty" else config.mix
+        mix = replace(config.mix, **_CHANGES.get(split, {}))
         wanted = getattr(config, split)
         for number, first in enumerate(range(0, wanted, config.shard)):
             count, seed = min(config.shard, wanted - first), start + config.seed + number
@@ -117,7 +120,7 @@ def write_manifest(config: Config) -> None:
     names = "".join(f"  {number}: {name}\n" for number, name in enumerate(CLASSES))
     folders = "".join(f"{split}: images/{split}\n" for split in ("train", "val"))
     (config.out / "data.yaml").write_text(f"path: {config.out.resolve()}\n{folders}names:\n{names}")
-    recipe = {key: value for key, value in asdict(config).items() if key not in ("out", "jobs")}
+    recipe = {key: value for key, value in asdict(config).items() if key not in ("out", "jobs")} | {"changes": _CHANGES}
     (config.out / "recipe.json").write_text(json.dumps(recipe, indent=1) + "\n")
 
 

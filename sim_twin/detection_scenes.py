@@ -68,6 +68,8 @@ class SceneMix:
     """In the twin's own colours and light."""
     occluded: float = 0.2
     """Something put in front of the first object on purpose."""
+    crowd: float = 0.0
+    """Four to eight objects instead of one to three: more to learn from a picture."""
 
 
 def draw_scene(stage: Stage, rng: np.random.Generator, mix: SceneMix | None = None) -> Picture:
@@ -79,7 +81,8 @@ def draw_scene(stage: Stage, rng: np.random.Generator, mix: SceneMix | None = No
     arm = "pieces" if by_wrist else "whole" if rng.random() < 0.25 else "none"
     camera = "wrist" if by_wrist else "free"
     T_base_camera, centre = place_camera(stage, by_wrist, rng)
-    objects = [] if rng.random() < mix.empty else choose_objects(stage, as_twin, rng)
+    crowd = mix.crowd > 0.0 and rng.random() < mix.crowd
+    objects = [] if rng.random() < mix.empty else choose_objects(stage, rng, as_twin=as_twin, crowd=crowd)
     places = place_objects(stage, objects, T_base_camera, centre=centre, by_wrist=by_wrist, rng=rng)
     place_distractors(stage, places, T_base_camera, centre, rng)
     if places and rng.random() < mix.occluded:
