@@ -14,6 +14,7 @@ from models.detector_weights import ARCHITECTURE, new_network, tame_ultralytics
 tame_ultralytics()  # before ultralytics is loaded
 
 import torch  # noqa: E402
+from torch import distributed  # noqa: E402
 from ultralytics.models.yolo.segment import SegmentationTrainer  # noqa: E402
 from ultralytics.nn.tasks import SegmentationModel  # noqa: E402
 from ultralytics.utils.instance import Instances  # noqa: E402
@@ -143,8 +144,20 @@ class CpuSegmentationTrainer(SegmentationTrainer):
         batch["img"] = batch["img"].contiguous(memory_format=torch.channels_last)
         return batch
 
+    def _setup_train(self) -> None:
+        """Prepare, then start all processes from the first one's weights."""
+        super()._setup_train()
+        if distributed.is_initialized():
+            for value in self.model.state_dict().values():
+                distributed.broadcast(value, 0)
+
     def optimizer_step(self) -> None:
-        """Step, with the learning rate of this very batch; ultralytics' own falls once an epoch."""
+        """Step, with the mean gradient of all processes and the learning rate of this very batch.
+
+        Ultralytics' own rate falls once an epoch, and its own processes want a GPU each.
+        """
+        if distributed.is_initialized():
+            self._average_gradients()
         super().optimizer_step()
         batches = len(self.train_loader)
         self.steps = getattr(self, "steps", self.start_epoch * batches) + 1
@@ -152,6 +165,13 @@ class CpuSegmentationTrainer(SegmentationTrainer):
             assert self.optimizer is not None and self.lf is not None
             for group in self.optimizer.param_groups:
                 group["lr"] = group["initial_lr"] * self.lf(self.steps / batches)
+
+    def _average_gradients(self) -> None:
+        gradients = [p.grad for p in self.model.parameters() if p.grad is not None]
+        flat = torch.cat([gradient.flatten() for gradient in gradients]) / distributed.get_world_size()
+        distributed.all_reduce(flat)
+        for gradient, mean in zip(gradients, flat.split([g.numel() for g in gradients]), strict=True):
+            gradient.copy_(mean.view_as(gradient))
 
     def validate(self):
         """Skip: held-out pictures are for the measurement after the training alone."""
@@ -163,6 +183,9 @@ class CpuSegmentationTrainer(SegmentationTrainer):
 
 def train_phase(phase: Phase, *, data: Path, folder: Path, start: Path | None, seed: int, threads: int) -> Path:
     """Train one phase, or what is left of it, and return its last checkpoint.
+
+    Where a process group of torch.distributed is there (RANK and LOCAL_RANK set before ultralytics is imported), its
+    processes share each batch.
 
     Args:
         phase: what to do.
@@ -181,10 +204,14 @@ def train_phase(phase: Phase, *, data: Path, folder: Path, start: Path | None, s
     settings |= {"optimizer": "AdamW", "weight_decay": 0.005, "nbs": phase.batch, "momentum": 0.9, "workers": 0}
     settings |= {"rect": True, "amp": False, "val": False, "plots": False, "patience": 0, "close_mosaic": 0}
     settings |= {"warmup_bias_lr": 0.0, "deterministic": True, "resume": str(last) if last.exists() else False}
+    settings["batch"] = phase.batch // (distributed.get_world_size() if distributed.is_initialized() else 1)
     settings["cache"] = "ram"  # the pictures at the phase's size: 0.7 to 3 GB
     trainer = CpuSegmentationTrainer(overrides=settings)
     trainer.add_callback("on_train_start", lambda _: torch.set_num_threads(threads))
+    trainer.world_size = 1 if distributed.is_initialized() else 0  # gradients are averaged here, not summed there
     trainer.train()
+    if distributed.is_initialized():
+        distributed.barrier()  # the first has written what the others go on from
     (folder / "done").touch()
     return last
 

@@ -1,15 +1,17 @@
 """Trains the detector on the CPU, from scratch, and writes its weights.
 
     python -m scripts.make_detection_dataset
-    nice -n 5 python -m scripts.train_detector       # goes on where it stopped
+    python -m scripts.train_detector --processes 2   # goes on where it stopped
     python -m scripts.evaluate_detector              # writes models/weights/detector.json and a picture
 
-Checkpoints and logs lie in out/detector/run. Three phases at growing picture sizes, see `models.detector_training`.
+Checkpoints and logs lie in out/detector/run. Phases at growing picture sizes, see `models.detector_training`.
 """
 
 from __future__ import annotations
 
 import json
+import os
+import tempfile
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -28,7 +30,9 @@ class Config:
     run: Path = Path("out/detector/run")
     """Folder for checkpoints; give another one to start anew."""
     threads: int = 1
-    """Processor threads."""
+    """Processor threads of each process."""
+    processes: int = 1
+    """Processes that share each batch; two cores do more as two processes than as two threads."""
     seed: int = 0
     """Of weights, order and augmentation."""
     weights: Path = WEIGHTS_FOLDER / "detector.npz"
@@ -37,12 +41,18 @@ class Config:
 
 def main(config: Config) -> None:
     """Train what is not trained yet, and write the weights."""
-    from models.detector_training import ARCHITECTURE, AUGMENTATION, CARD_SHARE, PHASES, read_checkpoint, train_phase
-    from models.detector_weights import save_detector
-
     manifest = config.data / "data.yaml"
     if not manifest.is_file():
         raise FileNotFoundError(f"{manifest} is missing; make it with `python -m scripts.make_detection_dataset`.")
+    if config.processes > 1:
+        _train_together(config)
+    write_weights(config, train(config, manifest))
+
+
+def train(config: Config, manifest: Path) -> Path:
+    """Train the phases that are not done, on the pictures of `manifest`; return the last checkpoint."""
+    from models.detector_training import PHASES, train_phase
+
     checkpoint = None
     for number, phase in enumerate(PHASES):
         folder = (config.run / f"{number}_{phase.imgsz}").resolve()
@@ -50,8 +60,38 @@ def main(config: Config) -> None:
             phase, data=manifest, folder=folder, start=checkpoint, seed=config.seed, threads=config.threads
         )
     assert checkpoint is not None
+    return checkpoint
+
+
+def _train_together(config: Config) -> None:
+    """Run `train` in several processes until all are done; when one fails the others are ended."""
+    from torch.multiprocessing.spawn import spawn
+
+    with tempfile.TemporaryDirectory() as folder:
+        spawn(_train_as_peer, (config, f"file://{folder}/rendezvous"), nprocs=config.processes)
+
+
+def _train_as_peer(rank: int, config: Config, rendezvous: str) -> None:
+    os.environ |= {"RANK": str(rank), "LOCAL_RANK": str(rank)}  # ultralytics reads them when it is imported
+    from torch import distributed
+
+    distributed.init_process_group("gloo", init_method=rendezvous, rank=rank, world_size=config.processes)
+    train(config, config.data / "data.yaml")
+    distributed.destroy_process_group()
+
+
+def write_weights(config: Config, checkpoint: Path) -> None:
+    """Write the weights of `checkpoint`, their checksum and the recipe."""
+    from models.detector_training import ARCHITECTURE, AUGMENTATION, CARD_SHARE, PHASES, read_checkpoint
+    from models.detector_weights import save_detector
+
     digest = save_detector(config.weights, read_checkpoint(checkpoint), CLASSES)
-    recipe = {"architecture": ARCHITECTURE, "seed": config.seed, "phases": [asdict(phase) for phase in PHASES]}
+    recipe = {
+        "architecture": ARCHITECTURE,
+        "seed": config.seed,
+        "processes": config.processes,
+        "phases": [asdict(phase) for phase in PHASES],
+    }
     recipe |= {
         "augmentation": AUGMENTATION | {"card": CARD_SHARE},
         "data": json.loads((config.data / "recipe.json").read_text()),

@@ -134,14 +134,21 @@ def place_objects(
     *,
     centre: np.ndarray,
     by_wrist: bool,
+    crowd: bool,
     rng: np.random.Generator,
 ) -> list[np.ndarray]:
-    """Put the first object at `centre`, the others near it; return the poses of those that fit, which stay."""
+    """Put the first object at `centre`, the others near it, or in a crowd wherever the camera looks.
+
+    Returns the poses (4, 4) of those that fit, which stay.
+    """
     poses: list[np.ndarray] = []
     for actor in list(objects):
         for _ in range(_TRIES):
             spread = 0.01 if not poses else 0.16
-            xy = centre[:2] + rng.normal(0.0, spread, 2)
+            around = _look_at(stage, T_base_camera, rng) if poses and crowd else centre
+            if around is None:
+                continue
+            xy = around[:2] + rng.normal(0.0, 0.01 if crowd else spread, 2)
             above = rng.uniform(0.01, 0.15) if rng.random() < 0.08 else 0.0  # lifted, or falling
             pose = _standing_at(actor, xy, _random_lean(rng), above)
             if _fits(stage, actor, pose, others=poses, T_base_camera=T_base_camera, by_wrist=by_wrist):

@@ -83,7 +83,7 @@ def draw_scene(stage: Stage, rng: np.random.Generator, mix: SceneMix | None = No
     T_base_camera, centre = place_camera(stage, by_wrist, rng)
     crowd = mix.crowd > 0.0 and rng.random() < mix.crowd
     objects = [] if rng.random() < mix.empty else choose_objects(stage, rng, as_twin=as_twin, crowd=crowd)
-    places = place_objects(stage, objects, T_base_camera, centre=centre, by_wrist=by_wrist, rng=rng)
+    places = place_objects(stage, objects, T_base_camera, centre=centre, by_wrist=by_wrist, crowd=crowd, rng=rng)
     place_distractors(stage, places, T_base_camera, centre, rng)
     if places and rng.random() < mix.occluded:
         place_occluder(stage, places[0], T_base_camera, rng)
