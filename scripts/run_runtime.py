@@ -1,6 +1,6 @@
 """See, plan and pick once, against a HAL process that runs already (`./z1 hal`).
 
-./z1 hal --hal sim          in one terminal
+./z1 hal --sim              in one terminal
 ./z1 run                    in another
 """
 

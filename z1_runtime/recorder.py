@@ -8,6 +8,7 @@ import socket
 import subprocess
 import sys
 from pathlib import Path
+from threading import Thread
 from typing import Any
 
 import rerun as rr
@@ -83,7 +84,12 @@ class Recorder:
             self._stream.flush(timeout_sec=timeout_s)
         except (RuntimeError, TimeoutError, ValueError) as error:
             logger.warning("the recording may lack its end: %s", error)
-        self._stream.disconnect()
+        # Rerun waits for its writer without end, also for one that died of a full disk.
+        closing = Thread(target=self._stream.disconnect, name="recording closes", daemon=True)
+        closing.start()
+        closing.join(timeout_s)
+        if closing.is_alive():
+            rr.unregister_shutdown()  # it would wait again when Python ends
 
     def _draw_arm(self, state: ArmState, status: ServoStatus) -> drawing.Drawing:
         return drawing.draw_arm(state, status, self._robot)

@@ -107,7 +107,7 @@ def why_not_found(rs: Any, serial: str, usb_devices: Path = _USB_DEVICES) -> str
         )
     return (
         f"{looked} Plug it into a USB 3 port with the cable it came with, try another port, and see what "
-        f"`lsusb -d {d405.USB_VENDOR}:` says; without a camera, use the twin (`--hal sim`)."
+        f"`lsusb -d {d405.USB_VENDOR}:` says; without a camera, use the twin (`--sim`)."
     )
 
 

@@ -115,7 +115,7 @@ class Z1Client:
         raise HalTimeoutError(
             f"no Z1 controller answers at {tried}; waited {timeout_s} s, "
             f"{heard if self.counts.refused else 'nothing came'}. Switch the arm on, check its cable, and start the "
-            f"vendor's `z1_ctrl` on that machine, or the twin with `./z1 twin --wire`."
+            f"vendor's `z1_ctrl` on that machine, or the twin with `./z1 twin wire`."
         )
 
     def close(self) -> None:

@@ -19,5 +19,5 @@ except ImportError as _error:
         f"with Python {_platform.python_version()}. PyPI has its wheels for x86_64 Linux and Windows only: there, "
         "run `uv sync`. Elsewhere build librealsense 2.56 or newer with -DBUILD_PYTHON_BINDINGS=ON "
         f"-DPYTHON_EXECUTABLE={_sys.executable} and install it, or keep the camera on an x86_64 PC, run `./z1 hal` "
-        "there and connect over Zenoh. The twin in one process (`--hal sim`) needs none of it."
+        "there and connect over Zenoh. The twin in one process (`--sim`) needs none of it."
     ) from _error

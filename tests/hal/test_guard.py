@@ -10,7 +10,8 @@ from servo_bench import START, Bench, move, setpoint
 
 from hal import z1
 from hal.errors import CommandRefusedError
-from hal.guard import Guard, Workspace, _segment_distance
+from hal.guard import Guard, Workspace
+from hal.guard_kernels import segment_distance
 from hal.messages import ServoMode, TrajectoryChunk
 from hal.z1_shape import HAND_POINTS
 
@@ -49,7 +50,7 @@ def test_its_kinematics_are_the_urdfs(shares: list[float]) -> None:
 
 
 @given(st.lists(st.floats(-1.0, 1.0), min_size=12, max_size=12))
-def test_segment_distance_is_the_least_over_both(numbers: list[float]) -> None:
+def testsegment_distance_is_the_least_over_both(numbers: list[float]) -> None:
     a, b, c, d = np.array(numbers).reshape(4, 3)
     if min(np.linalg.norm(b - a), np.linalg.norm(d - c)) < 0.01:
         return
@@ -57,7 +58,7 @@ def test_segment_distance_is_the_least_over_both(numbers: list[float]) -> None:
     gaps = a + s[..., None] * (b - a) - c - t[..., None] * (d - c)
     least = np.linalg.norm(gaps, axis=-1).min()
     step = (np.linalg.norm(b - a) + np.linalg.norm(d - c)) / 60
-    assert least - step <= _segment_distance(a, b, c, d) <= least + 1e-9
+    assert least - step <= segment_distance(a, b, c, d) <= least + 1e-9
 
 
 def test_home_and_the_folded_pose_are_allowed(guard: Guard) -> None:

@@ -84,7 +84,7 @@ def test_where_there_is_no_wheel_the_error_says_what_to_do() -> None:
     code = "import sys; sys.modules['pyrealsense2'] = None; import hal.realsense"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 1
-    for words in ("SdkMissingError", "x86_64 Linux and Windows only", "-DBUILD_PYTHON_BINDINGS=ON", "--hal sim"):
+    for words in ("SdkMissingError", "x86_64 Linux and Windows only", "-DBUILD_PYTHON_BINDINGS=ON", "--sim"):
         assert words in done.stderr
 
 
