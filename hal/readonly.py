@@ -29,16 +29,6 @@ class ReadonlyServo(Servo):
             f"{_WHY}, so it cannot stop the arm ({reason}): stop whoever moves it, or use the switch on the arm."
         )
 
-    def tick(self) -> None:
-        """One cycle: measure and tell.
-
-        Raises:
-            NotConnectedError: before `connect()`.
-        """
-        self._connected()
-        self._ticked = True
-        now_s = self.clock.now_s()
-        self.periods.record(now_s)
-        self._measure()
+    def _act(self, now_s: float) -> None:
+        """Command nothing: what the arm does is what it was told."""
         self._q_sent = self._motion.q = self._state.q
-        self._publish(now_s)

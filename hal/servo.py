@@ -221,9 +221,12 @@ class Servo:
         now_s = self.clock.now_s()
         self.periods.record(now_s)
         self._measure()
-        q, dq = self._choose(now_s)
-        self._command(q, dq)
+        self._act(now_s)
         self._publish(now_s)
+
+    def _act(self, now_s: float) -> None:
+        """Command the arm for this cycle."""
+        self._command(*self._choose(now_s))
 
     def _measure(self) -> None:
         try:

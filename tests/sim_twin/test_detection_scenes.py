@@ -165,3 +165,15 @@ def test_a_photograph_is_noisy_in_every_channel_and_brought_to_a_fair_exposure()
         assert photo.mean() > dark.mean()
         noise.append(photo.std(axis=(0, 1)))
     assert (np.median(noise, axis=0) > 1.0).all()
+
+
+@needs_egl
+def test_a_crowd_shows_more_objects(stage: Stage) -> None:
+    def shown(crowd: float) -> list[int]:
+        mix = SceneMix(empty=0.0, twin_look=0.0, crowd=crowd)
+        return [len(draw_scene(stage, np.random.default_rng([5, n]), mix).labels) for n in range(8)]
+
+    few, many = shown(0.0), shown(1.0)
+    assert max(few) <= 3
+    assert sum(many) > sum(few)
+    assert max(many) > 3
