@@ -1,7 +1,8 @@
 """Orders grasps by what this arm and this gripper can do with them, not by what they are worth to any hand.
 
 Three steps, each dearer than the one before and asked of fewer: is there room for the beak, how well would it hold, and
-can the arm go there. How well it would hold is a weighted sum of terms in [0, 1]; the weights are set by hand.
+can the arm go there. How well it would hold is a weighted sum of terms in [0, 1] whose weights are set by hand, or a
+probability that a fitted head gives.
 """
 
 from __future__ import annotations
@@ -35,7 +36,15 @@ class AbilityRanking:
         self._planner = config
         self._config = config.ability
 
-    def scores(self, middle: np.ndarray, generator: np.ndarray, alignments: np.ndarray) -> np.ndarray:
+    def scores(
+        self,
+        middle: np.ndarray,
+        generator: np.ndarray,
+        alignments: np.ndarray,
+        *,
+        likely: np.ndarray | None = None,
+        wanted: np.ndarray | None = None,
+    ) -> np.ndarray:
         """Return what each candidate is worth, (N,).
 
         The whole part says how far it was followed: 2 the arm reaches it, 1 there is room for the beak (and the arm
@@ -45,25 +54,32 @@ class AbilityRanking:
             middle: (3,) of the object, in the base frame [m].
             generator: (N,) scores in [0, 1].
             alignments: (N,) with the box, in [0, 1].
+            likely: (N,) probabilities that stand for the weighted sum.
+            wanted: (N,) bool; the quality of the others counts a thousandth, so that they are asked last.
         """
         ways = [self._candidates.ways(rank) for rank in range(len(self._candidates))]
         free = np.array([not isinstance(way, Problem) for way in ways], dtype=bool)
-        quality = 0.999 * self._quality(middle, generator, alignments)
+        if likely is None:
+            quality = 0.999 * self.quality(middle, generator, alignments)
+        else:
+            quality = 0.999 * (1.0 - self._config.ease) * likely
+        if wanted is not None:
+            quality = np.where(wanted, quality, 1e-3 * quality)
         scores = np.where(free, _FREE, _REFUSED) + quality
         reached = 0
         order = np.argsort(-quality, kind="stable")
         for rank in order[free[order]][: self._config.n_asked]:
             found = ways[rank]
             assert not isinstance(found, Problem)
-            ease = max((self._ease(way) for way in found), default=0.0)
+            ease = max((self.ease(way) for way in found), default=0.0)
             scores[rank] = _WITHIN_REACH + quality[rank] + 0.999 * self._config.ease * ease if ease else quality[rank]
             reached += ease > 0.0
             if reached == self._config.n_reached:
                 break
         return scores
 
-    def _quality(self, middle: np.ndarray, generator: np.ndarray, alignments: np.ndarray) -> np.ndarray:
-        """Return how well each grasp would hold, (N,), in [0, 1 - the weight of `ease`]."""
+    def quality(self, middle: np.ndarray, generator: np.ndarray, alignments: np.ndarray) -> np.ndarray:
+        """Return how well each grasp would hold, (N,), in [0, 1 - the weight of `ease`]; arguments as in `scores`."""
         config, candidates = self._config, self._candidates
         away = np.linalg.norm(candidates.contacts - middle, axis=1) / config.centring_m
         return (
@@ -74,7 +90,7 @@ class AbilityRanking:
             + config.box * np.clip(np.nan_to_num(alignments), 0.0, 1.0)
         )
 
-    def _ease(self, way: Way) -> float:
+    def ease(self, way: Way) -> float:
         """Return how easily the arm goes `way`, in (0, 1]; 0 if it cannot."""
         for standoff_m in dict.fromkeys((self._planner.standoff_m, self._planner.short_standoff_m)):
             ease = max((self._posture_ease(qs) for qs in self._chains(way, standoff_m)), default=0.0)

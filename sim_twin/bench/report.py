@@ -80,9 +80,14 @@ def write_report(rows: Sequence[Row], summary: Mapping[str, Any], path: Path, pi
         _gallery(pictures),
         _settings(summary.get("run", {})),
     ]
+    write_page(path, title, parts)
+
+
+def write_page(path: Path, title: str, parts: Sequence[str]) -> None:
+    """Write a page of `parts` (HTML) in the reports' style; it replaces the one at `path` once it is whole."""
     head = (
         f"<!doctype html><html lang='en'><meta charset='utf-8'><meta name='viewport' content='width=device-width'>"
-        f"<title>{title}</title><style>{_STYLE}</style>"
+        f"<title>{escape(title)}</title><style>{_STYLE}</style>"
     )
     partial = path.with_suffix(".partial")
     partial.write_text(head + "\n".join(parts) + "</html>\n", encoding="utf-8")

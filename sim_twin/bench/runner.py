@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, ProcessPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import islice
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 from sim_twin.bench.episode import run_scenario
 from sim_twin.bench.methods import Method
@@ -22,6 +22,8 @@ from z1_runtime.config import RuntimeConfig
 
 if TYPE_CHECKING:
     from z1_runtime.decision import Decider
+
+T = TypeVar("T")
 
 ONE_THREAD = {name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")}
 """Environment of a process that shall keep to one core: the workers themselves fill the machine."""
@@ -65,25 +67,32 @@ def run_task(task: Task) -> list[Row]:
     return run_scenario(task.scenario, task.methods, decider, top_k=task.top_k, recordings=task.recordings)
 
 
-def run_tasks(tasks: Sequence[Task], jobs: int) -> Iterator[list[Row]]:
+def run_tasks(tasks: Sequence[T], jobs: int, run: Callable[[T], list[Row]] = run_task) -> Iterator[list[Row]]:
     """Yield the rows of each task as it ends, in any order; `jobs` processes share them.
 
     A row does not depend on `jobs`, nor on which process made it: each scenario has its own seeds.
+
+    Args:
+        tasks: what `run` takes; they are sent to the processes.
+        jobs: how many processes.
+        run: does one task; a function of a module, which the processes import.
     """
     # A fresh interpreter for each: forked ones would share OpenGL and torch with this one.
     context = multiprocessing.get_context("spawn")
     jobs = min(jobs, max(len(tasks), 1))
     with environment(ONE_THREAD), ProcessPoolExecutor(jobs, mp_context=context, initializer=one_thread) as pool:
-        yield from _in_order_of_ending(pool, tasks, 2 * jobs)
+        yield from _in_order_of_ending(pool, tasks, 2 * jobs, run)
 
 
-def _in_order_of_ending(pool: Executor, tasks: Sequence[Task], ahead: int) -> Iterator[list[Row]]:
+def _in_order_of_ending(
+    pool: Executor, tasks: Sequence[T], ahead: int, run: Callable[[T], list[Row]]
+) -> Iterator[list[Row]]:
     waiting = iter(tasks)
-    running = {pool.submit(run_task, task) for task in islice(waiting, ahead)}
+    running = {pool.submit(run, task) for task in islice(waiting, ahead)}
     while running:
         ended, running = wait(running, return_when=FIRST_COMPLETED)
         for future in ended:
-            running |= {pool.submit(run_task, task) for task in islice(waiting, 1)}
+            running |= {pool.submit(run, task) for task in islice(waiting, 1)}
             yield future.result()
 
 

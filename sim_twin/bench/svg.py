@@ -101,6 +101,31 @@ def rate_grid(rows: Sequence[str], columns: Sequence[str], cells: Mapping[tuple[
     return _figure(left + wide * len(columns) + 4, _TOP + high * len(rows), parts, caption)
 
 
+def count_grid(
+    rows: Sequence[str],
+    columns: Sequence[str],
+    cells: Mapping[tuple[str, str], tuple[int, str]],
+    most: int,
+    caption: str,
+) -> str:
+    """Return a grid of counts with a word below each: the darker the more, `most` being the darkest."""
+    left, wide, high = _room(rows), 74, 44
+    parts = [_text(left + (c + 0.5) * wide, 12, name, "middle") for c, name in enumerate(columns)]
+    for r, row in enumerate(rows):
+        y = _TOP + r * high
+        parts.append(_text(left - 8, y + high / 2 + 4, row, "end"))
+        for c, column in enumerate(columns):
+            x = left + c * wide
+            count, word = cells.get((row, column), (-1, ""))
+            share = float(np.sqrt(min(max(count, 0) / max(most, 1), 1.0)))
+            fill = _blend(share) if count >= 0 else "#edf2f7"
+            ink = "#fff" if share > 0.55 else _INK
+            parts.append(f'<rect x="{x}" y="{y}" width="{wide - 2}" height="{high - 2}" fill="{fill}"/>')
+            parts.append(_text(x + wide / 2 - 1, y + 19, str(count) if count >= 0 else "–", "middle", ink))
+            parts.append(_text(x + wide / 2 - 1, y + 34, word, "middle", ink))
+    return _figure(left + wide * len(columns) + 4, _TOP + high * len(rows), parts, caption)
+
+
 def _rate_axis(left: float, height: float) -> str:
     lines = []
     for share in np.linspace(0.0, 1.0, 5):
