@@ -14,6 +14,7 @@ COMMANDS = {
     "demo": ("scripts.run_demo", "the twin sees an object and lifts it, end to end"),
     "run": ("scripts.run_runtime", "see, plan and move, against a HAL that runs already"),
     "bench": ("scripts.run_benchmark", "the paper's 81 scenarios: success by method, with intervals"),
+    "tune": ("scripts.run_tune", "fit the ranking to logged episodes; keep what is set by hand unless that loses"),
     "hal": ("scripts.run_hal", "serve the arm and the camera, with the servo loop and its limits"),
     "calibrate": ("scripts.calibrate", "the wrist camera, with a printed board: hand-eye, intrinsics, touch test"),
     "twin": ("scripts.run_twin", "the twin in place of a device: run-script for pyrealsense2, wire for a Z1's clients"),
@@ -29,7 +30,7 @@ without `Config` takes the bare arguments: `main(list[str]) -> int`."""
 
 ROOMS = ("hal", "models", "calibration", "z1_runtime", "sim_twin", "scripts")
 
-BAD_INPUT = {"ConfigError", "UnknownBackendError", "ViewerPortError"}
+BAD_INPUT = {"ConfigError", "ScoringError", "TuneError", "UnknownBackendError", "ViewerPortError"}
 """Errors of ours that say the call was wrong, not that the work failed; so is a plain `ValueError` of our own."""
 
 FAILED, BAD_USAGE, INTERRUPTED = 1, 2, 130

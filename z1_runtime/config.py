@@ -59,6 +59,9 @@ class RuntimeConfig:
     alpha: float = 0.85
     """Weight of the alignment against the generator's score (the paper's α), among grasps that are worth the same to
     arm and gripper (`planner.ability`)."""
+    scoring: str = ""
+    """A file of `./z1 tune`, whose box, faces, weights and thresholds then stand for `box_method`, `k_faces`, `alpha`
+    and, if it holds a head, for the weights of `planner.ability`; empty = those set here."""
     speed: float = 0.5
     """Fraction of the arm's speed, acceleration and jerk limits that motions use, in (0, 1]."""
     jaw_home: float = -1.0
@@ -119,7 +122,16 @@ def load_config(path: Path | None = None) -> RuntimeConfig:
         raise ConfigError(f"the configuration {path} cannot be read: {err.strerror}.") from err
     except yaml.YAMLError as err:
         raise ConfigError(f"the configuration {path} is not YAML: {err}") from err
-    return _overlay(RuntimeConfig(), data or {}, str(path))
+    return config_from(data or {}, str(path))
+
+
+def config_from(data: Mapping[str, Any], where: str) -> RuntimeConfig:
+    """Return the defaults with the values of `data` put over them, as `asdict`, YAML and JSON give them.
+
+    Raises:
+        ConfigError: a key or a value does not belong there; the message begins with `where`.
+    """
+    return _overlay(RuntimeConfig(), data, where)
 
 
 def with_detector(

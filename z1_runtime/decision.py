@@ -19,6 +19,7 @@ from z1_runtime.detectors import TruthDetector
 from z1_runtime.kinematics import Kinematics
 from z1_runtime.perception import Perception, PerceptionError
 from z1_runtime.planner import GraspPlanner, NoPlanError
+from z1_runtime.scoring import Ranking, ranking_of
 from z1_runtime.types import GraspPlan, Observation
 
 _LOG = logging.getLogger(__name__)
@@ -62,6 +63,9 @@ class Decider:
         planner: finds the first that the arm can do.
         config: the numbers of the algorithm.
         T_flange_camera: (4, 4) hand-eye transform.
+
+    Raises:
+        ScoringError: the scoring file that `config` names cannot be used.
     """
 
     def __init__(
@@ -79,6 +83,7 @@ class Decider:
         self.generator = generator
         self.planner = planner
         self.config = config
+        self.ranking = ranking_of(config)
         self.T_flange_camera = T_flange_camera
 
     def decide(self, frame: RgbdFrame, q: np.ndarray) -> Decision:
@@ -104,9 +109,9 @@ class Decider:
         with times.stage("generate"):
             candidates = self.propose(observation)
         with times.stage("mvbb"):
-            ranked = self._chosen_by_box(candidates, observation)
+            ranked = self._chosen_by_box(candidates, observation, self.ranking)
         with times.stage("rank"):
-            ranked = self._by_ability(ranked, observation)
+            ranked = self._by_ability(ranked, observation, self.ranking)
         return candidates, ranked, self.planner.plan(ranked.grasps, observation, q, times.stage)
 
     def observe(self, frame: RgbdFrame, q: np.ndarray, times: StageTimes | None = None) -> Observation:
@@ -131,34 +136,39 @@ class Decider:
         """
         return self.generator.sample(observation.object_points, self.config.n_candidates, self.config.seed)
 
-    def rank(self, candidates: GraspSet, observation: Observation) -> RankedGrasps:
+    def rank(self, candidates: GraspSet, observation: Observation, ranking: Ranking | None = None) -> RankedGrasps:
         """Return the candidates that come at one of the nearest faces of the object's box, best first.
 
         The box chooses, as in the paper; among those it lets pass the order is by what arm and gripper can do.
+
+        Args:
+            candidates: camera frame.
+            observation: the frame they were made from.
+            ranking: the numbers to do it by; None are the configuration's.
 
         Raises:
             DegenerateCloudError: the object's cloud spans no box.
             NoPlanError: none does.
         """
-        return self._by_ability(self._chosen_by_box(candidates, observation), observation)
+        ranking = ranking or self.ranking
+        return self._by_ability(self._chosen_by_box(candidates, observation, ranking), observation, ranking)
 
-    def _chosen_by_box(self, candidates: GraspSet, observation: Observation) -> RankedGrasps:
-        config = self.config
+    def _chosen_by_box(self, candidates: GraspSet, observation: Observation, ranking: Ranking) -> RankedGrasps:
         up = observation.T_base_camera[2, :3]  # the base's z axis, seen from the camera
-        box = fit_obb(observation.object_points, config.box_method, up=up)
-        ranked = rank_grasps(candidates, box, k=config.k_faces, alpha=config.alpha)
+        box = fit_obb(observation.object_points, ranking.box_method, up=up)
+        ranked = rank_grasps(candidates, box, k=ranking.k_faces, alpha=ranking.alpha, hard_filter=ranking.hard_filter)
         if not len(ranked):
             raise NoPlanError(
-                f"none of {len(candidates)} candidates comes at one of the {config.k_faces} nearest faces of the "
+                f"none of {len(candidates)} candidates comes at one of the {ranking.k_faces} nearest faces of the "
                 "object's box; raise k_faces or n_candidates, or look from another side.",
                 rejections=(),
             )
         return ranked
 
-    def _by_ability(self, ranked: RankedGrasps, observation: Observation) -> RankedGrasps:
+    def _by_ability(self, ranked: RankedGrasps, observation: Observation, ranking: Ranking) -> RankedGrasps:
         assert ranked.box is not None
         middle = ranked.box.T_camera_box[:3, 3]
-        return ranked.reordered(self.planner.ability(ranked.grasps, observation, middle, ranked.alignments))
+        return ranked.reordered(self.planner.ability(ranked.grasps, observation, middle, ranked.alignments, ranking))
 
     def warm_up(self) -> None:
         """Decide once on a drawn scene, so that the first real frame does not wait for compilers and caches."""

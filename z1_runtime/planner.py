@@ -25,6 +25,8 @@ from z1_runtime.grasp_motion import Motion, MotionPlanner, Refused, StageTimer
 from z1_runtime.gripper import BeakGripper
 from z1_runtime.kinematics import Kinematics
 from z1_runtime.planner_config import PlannerConfig
+from z1_runtime.scoring import Ranking
+from z1_runtime.scoring_features import measure, seen_by_box
 from z1_runtime.trajectory import MotionLimits
 from z1_runtime.types import GraspPlan, IkMethod, Observation, Rejection
 
@@ -63,7 +65,12 @@ class GraspPlanner:
         fitting.warm_up()
 
     def ability(
-        self, grasps: GraspSet, observation: Observation, middle: np.ndarray, alignments: np.ndarray
+        self,
+        grasps: GraspSet,
+        observation: Observation,
+        middle: np.ndarray,
+        alignments: np.ndarray,
+        ranking: Ranking | None = None,
     ) -> np.ndarray:
         """Return what each of `grasps` (camera frame) is worth to this arm and gripper, (N,): the more the better.
 
@@ -72,14 +79,53 @@ class GraspPlanner:
             observation: the frame they were made from.
             middle: (3,) of the object, camera frame [m].
             alignments: (N,) with a face of the object's box, in [0, 1].
+            ranking: whose head and thresholds count; None has neither.
         """
-        config, T_base_camera = self.config, observation.T_base_camera
-        checker = CollisionChecker(self._kinematics, observation, None, config.collision)
-        candidates = Candidates(
-            grasps, T_base_camera, self.gripper, checker, fallback_width_m=config.fallback_width_m, chunk=len(grasps)
+        checker, candidates = self._laid_out(grasps, observation)
+        middle = _standing(transform(observation.T_base_camera, middle), checker)
+        ability = AbilityRanking(self._kinematics, checker, candidates, self.config)
+        head = ranking.head if ranking else None
+        likely = head.probability(self._measured(grasps, observation, checker, candidates)) if head else None
+        wanted = ranking.wanted(alignments, grasps.scores) if ranking else None
+        return ability.scores(middle, grasps.scores, alignments, likely=likely, wanted=wanted)
+
+    def features(self, grasps: GraspSet, observation: Observation) -> np.ndarray:
+        """Return what a scoring head goes by, (N, 11): the columns of `z1_runtime.scoring_features.FEATURES`.
+
+        Args:
+            grasps: camera frame, with the generator's scores.
+            observation: the frame they were made from.
+
+        Raises:
+            DegenerateCloudError: the object's cloud spans no box.
+        """
+        return self._measured(grasps, observation, *self._laid_out(grasps, observation))
+
+    def _laid_out(self, grasps: GraspSet, observation: Observation) -> tuple[CollisionChecker, Candidates]:
+        checker = CollisionChecker(self._kinematics, observation, None, self.config.collision)
+        return checker, Candidates(
+            grasps,
+            observation.T_base_camera,
+            self.gripper,
+            checker,
+            fallback_width_m=self.config.fallback_width_m,
+            chunk=len(grasps),
         )
-        ranking = AbilityRanking(self._kinematics, checker, candidates, config)
-        return ranking.scores(_standing(transform(T_base_camera, middle), checker), grasps.scores, alignments)
+
+    def _measured(
+        self, grasps: GraspSet, observation: Observation, checker: CollisionChecker, candidates: Candidates
+    ) -> np.ndarray:
+        candidates.free()  # lays all of them out
+        approaches = grasps.T_camera_grasps[:, :3, 2] @ observation.T_base_camera[:3, :3].T
+        alignments, middle = seen_by_box(grasps, observation)
+        return measure(
+            candidates,
+            approaches=approaches,
+            middle=_standing(transform(observation.T_base_camera, middle), checker),
+            table=checker.table,
+            alignments=alignments,
+            generator=grasps.scores,
+        )
 
     def plan(
         self, ranked: GraspSet, observation: Observation, q_start: np.ndarray, timer: StageTimer | None = None

@@ -147,8 +147,21 @@ def _decide(method: Method, decider: Decider, seen: Seen) -> Attempt:
     except (DegenerateCloudError, NoPlanError) as error:
         rejections = error.rejections if isinstance(error, NoPlanError) else ()
         outcome = Outcome(mode=_why_no_plan(rejections), detail=str(error))
-        return Attempt(times=times, outcome=outcome, seen=seen, ranked=ranked, left=left, rejections=rejections)
-    return Attempt(times=times, seen=seen, ranked=ranked, left=left, plan=plan, rejections=plan.rejections)
+        attempt = Attempt(times=times, outcome=outcome, seen=seen, ranked=ranked, left=left, rejections=rejections)
+    else:
+        attempt = Attempt(times=times, seen=seen, ranked=ranked, left=left, plan=plan, rejections=plan.rejections)
+    return replace(attempt, features=_features(attempt, decider))
+
+
+def _features(attempt: Attempt, decider: Decider) -> np.ndarray | None:
+    """Return what a scoring head would go by (see `Attempt.features`), where something was ranked."""
+    if not attempt.ranked or attempt.seen is None:
+        return None
+    of = [0, 0 if attempt.plan is None else attempt.plan.rank]
+    try:
+        return decider.planner.features(attempt.ranked.grasps[np.array(of)], attempt.seen.observation)
+    except DegenerateCloudError:  # a method that fits no box goes on without one
+        return None
 
 
 def _why_no_plan(rejections: Sequence[Rejection]) -> Mode:

@@ -17,6 +17,7 @@ from sim_twin.bench.seen import Seen
 from sim_twin.bench.targeting import overlap
 from sim_twin.bench.trial import Mode, Outcome
 from z1_runtime.decision import StageTimes
+from z1_runtime.scoring_features import FEATURES
 from z1_runtime.types import GraspPlan, Rejection
 
 Row = dict[str, Any]
@@ -39,6 +40,9 @@ class Attempt:
     """(M,) candidates left before the ranking, whose indices count in these."""
     plan: GraspPlan | None = None
     rejections: Sequence[Rejection] = ()
+    features: np.ndarray | None = None
+    """(2, 11) of `z1_runtime.scoring_features.FEATURES`, of the first-ranked and, if there is a plan, of the executed
+    grasp."""
 
     @property
     def ended(self) -> Outcome:
@@ -85,7 +89,7 @@ def make_row(
     row |= {f"{stage}_ms": ms for stage, ms in last.times.ms.items()}
     reasons = Counter(rejection.reason for rejection in last.rejections)
     row |= {f"rejected_{reason}": reasons[reason] for reason in REASONS}
-    row |= _of_look(last.seen) | _of_ranking(last) | _of_plan(last)
+    row |= _of_look(last.seen) | _of_ranking(last) | _of_plan(last) | _of_features(last)
     return row if qpos is None else row | {"final_qpos": qpos.tolist()}
 
 
@@ -139,3 +143,18 @@ def _of_plan(attempt: Attempt) -> Row:
         "T_base_grasp": plan.T_base_grasp.ravel().tolist(),
         "T_base_pivot": plan.T_base_pivot.ravel().tolist(),
     }
+
+
+def _of_features(attempt: Attempt) -> Row:
+    """Return what a scoring head is fitted to: of the first-ranked grasp `first_…`, of the executed one `grasp_…`."""
+    ranked, left, features = attempt.ranked, attempt.left, attempt.features
+    if ranked is None or left is None or features is None:
+        return {}
+    row: Row = {
+        "first_candidate": int(left[ranked.indices[0]]),
+        "first_box_alignment": float(ranked.alignments[0]),
+    }
+    row |= {f"first_{name}": float(value) for name, value in zip(FEATURES, features[0], strict=True)}
+    if attempt.plan is not None:
+        row |= {f"grasp_{name}": float(value) for name, value in zip(FEATURES, features[1], strict=True)}
+    return row

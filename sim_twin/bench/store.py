@@ -7,6 +7,7 @@ flight and nothing else, and `--resume` goes on with those that are missing.
 
 from __future__ import annotations
 
+import hashlib
 import os
 from collections.abc import Iterable
 from pathlib import Path
@@ -17,6 +18,7 @@ import pyarrow.parquet as pq
 from sim_twin.bench.rows import Row
 
 FOLDER, TABLE = "episodes", "episodes.parquet"
+_LONGEST_NAME = 100
 
 
 class Store:
@@ -45,6 +47,8 @@ class Store:
         """Keep the rows of one scenario; on return they are on the disk."""
         rows = list(rows)
         methods = "+".join(sorted(str(row["method"]).replace(":", "_").replace("=", "") for row in rows))
+        if len(methods) > _LONGEST_NAME or "/" in methods:  # many variants, or one with the path of its scoring
+            methods = hashlib.sha256(methods.encode()).hexdigest()[:16]
         path = self._folder / f"{rows[0]['scenario']}-{methods}.parquet"
         partial = path.with_suffix(".partial")
         pq.write_table(pa.Table.from_pylist(_even(rows)), partial)
