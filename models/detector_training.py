@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import random
 from dataclasses import asdict, dataclass
 from pathlib import Path
-
-import cv2
-import numpy as np
 
 from models.detector_weights import ARCHITECTURE, new_network, tame_ultralytics
 
@@ -17,8 +13,6 @@ import torch  # noqa: E402
 from torch import distributed  # noqa: E402
 from ultralytics.models.yolo.segment import SegmentationTrainer  # noqa: E402
 from ultralytics.nn.tasks import SegmentationModel  # noqa: E402
-from ultralytics.utils.instance import Instances  # noqa: E402
-from ultralytics.utils.ops import resample_segments  # noqa: E402
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -42,7 +36,9 @@ PHASES = (
     Phase(imgsz=256, epochs=12, lr0=2.0e-3, lrf=0.7, warmup_epochs=1.0, batch=16),
     Phase(imgsz=256, epochs=5, lr0=1.4e-3, lrf=0.9, warmup_epochs=0.2, batch=16),
     Phase(imgsz=256, epochs=9, lr0=1.3e-3, lrf=0.25, warmup_epochs=0.2, batch=16),
-    Phase(imgsz=384, epochs=3, lr0=3.5e-4, lrf=0.1, warmup_epochs=0.1, batch=16),
+    Phase(imgsz=256, epochs=2, lr0=1.2e-3, lrf=0.5, warmup_epochs=0.2, batch=16),
+    Phase(imgsz=256, epochs=20, lr0=1.3e-3, lrf=0.12, warmup_epochs=0.2, batch=16),
+    Phase(imgsz=320, epochs=3, lr0=2.0e-4, lrf=0.1, warmup_epochs=0.1, batch=16),
 )
 """Small pictures teach most of it at a fraction of the time; the last have the size at which the network is used."""
 
@@ -58,50 +54,6 @@ AUGMENTATION = {
     "mosaic": 0.0,
 }
 """On top of what the scenes vary themselves. No mosaic: four scenes of a quarter's size are not what the arm sees."""
-
-
-CARD_SHARE = 0.2
-"""Share of the pictures with one object in which a card hides some of it."""
-
-
-class HideBehindCard:
-    """Hides up to 45 % of a lone object's extent behind a flat card that comes in from a random side."""
-
-    def __call__(self, labels: dict) -> dict:
-        """Return ultralytics' labels with picture, outline and box changed."""
-        instances = labels["instances"]
-        if len(instances) != 1 or random.random() > CARD_SHARE:
-            return labels
-        outline, angle = instances.segments[0], random.uniform(0.0, 2.0 * np.pi)
-        away = np.array([np.cos(angle), np.sin(angle)])
-        along = outline @ away
-        edge = along.max() - random.uniform(0.1, 0.45) * (along.max() - along.min())
-        left, top, right, bottom = instances.bboxes[0] + np.array([-1, -1, 1, 1]) * random.uniform(2.0, 25.0)
-        card = clip_polygon(np.array([[left, top], [right, top], [right, bottom], [left, bottom]]), -away, -edge)
-        shade = random.choices(range(20, 60), k=3) if random.random() < 0.5 else random.choices(range(256), k=3)
-        labels["img"] = np.ascontiguousarray(labels["img"])
-        cv2.fillPoly(labels["img"], [np.round(card).astype(np.int32)], shade)
-        left_over = clip_polygon(outline, away, edge)
-        box = np.concatenate([left_over.min(axis=0), left_over.max(axis=0)])[None].astype(np.float32)
-        outlines = np.stack(resample_segments([left_over.astype(np.float32)], n=len(outline)))
-        labels["instances"] = Instances(box, outlines, None, bbox_format="xyxy", normalized=False)
-        return labels
-
-
-def clip_polygon(corners: np.ndarray, away: np.ndarray, edge: float) -> np.ndarray:
-    """Return the part (M, 2) of a polygon (N, 2) where `corner @ away <= edge`, by Sutherland and Hodgman's cut.
-
-    A part that falls in two stays joined along the cut.
-    """
-    over = corners @ away - edge
-    kept = []
-    for number in range(len(corners)):
-        here, before = over[number], over[number - 1]
-        if (here > 0) != (before > 0):
-            kept.append(corners[number - 1] + (corners[number] - corners[number - 1]) * before / (before - here))
-        if here <= 0:
-            kept.append(corners[number])
-    return np.array(kept).reshape(-1, 2)
 
 
 class Bf16SegmentationModel(SegmentationModel):
@@ -130,13 +82,6 @@ class CpuSegmentationTrainer(SegmentationTrainer):
         if weights:
             model.load(weights)
         return model.to(memory_format=torch.channels_last)
-
-    def build_dataset(self, img_path, mode="train", batch=None):
-        """Return ultralytics' data set; where it augments, cards come after the warp and before the colours."""
-        dataset = super().build_dataset(img_path, mode, batch)
-        if mode == "train":
-            dataset.transforms.insert(1, HideBehindCard())
-        return dataset
 
     def preprocess_batch(self, batch: dict) -> dict:
         """Return the batch with its pictures in channels-last."""

@@ -82,7 +82,7 @@ def _train_as_peer(rank: int, config: Config, rendezvous: str) -> None:
 
 def write_weights(config: Config, checkpoint: Path) -> None:
     """Write the weights of `checkpoint`, their checksum and the recipe."""
-    from models.detector_training import ARCHITECTURE, AUGMENTATION, CARD_SHARE, PHASES, read_checkpoint
+    from models.detector_training import ARCHITECTURE, AUGMENTATION, PHASES, read_checkpoint
     from models.detector_weights import save_detector
 
     digest = save_detector(config.weights, read_checkpoint(checkpoint), CLASSES)
@@ -92,10 +92,7 @@ def write_weights(config: Config, checkpoint: Path) -> None:
         "processes": config.processes,
         "phases": [asdict(phase) for phase in PHASES],
     }
-    recipe |= {
-        "augmentation": AUGMENTATION | {"card": CARD_SHARE},
-        "data": json.loads((config.data / "recipe.json").read_text()),
-    }
+    recipe |= {"augmentation": AUGMENTATION, "data": json.loads((config.data / "recipe.json").read_text())}
     recipe |= {"losses": _read_losses(config.run), "versions": _versions()}
     config.weights.with_suffix(".recipe.json").write_text(json.dumps(recipe, indent=1) + "\n")
     print(f"wrote {config.weights} ({config.weights.stat().st_size / 1e6:.1f} MB, SHA-256 {digest[:12]}…)")

@@ -26,8 +26,10 @@ if TYPE_CHECKING:
 
 LEAST_PIXELS = 600
 """An object that shows fewer pixels at 640×480 is taken out of the scene."""
-LEAST_SHARE = 0.45
+LEAST_SHARE = 0.5
 """So is one that shows less of its outline, unless it fills `_LARGE_SHARE` of the picture."""
+LEAST_MARK_SHARE = 0.5
+"""So is a bottle in random colours that shows less of its neck: nothing else tells it from a cylinder."""
 _LARGE_SHARE = 0.15
 
 
@@ -62,9 +64,9 @@ class SceneMix:
 
     empty: float = 0.1
     """No object at all, only distractors or nothing."""
-    wrist: float = 0.75
+    wrist: float = 0.85
     """Seen by the wrist camera past the jaws; the others from anywhere."""
-    twin_look: float = 0.25
+    twin_look: float = 0.35
     """In the twin's own colours and light."""
     occluded: float = 0.2
     """Something put in front of the first object on purpose."""
@@ -91,7 +93,7 @@ def draw_scene(stage: Stage, rng: np.random.Generator, mix: SceneMix | None = No
         stage.dress_as_twin()
     else:
         stage.dress_at_random(rng)
-    labels = _see(stage, objects, camera, arm)
+    labels = _see(stage, objects, camera, arm, by_shape=not as_twin)
     colour = stage.draw(camera, arm, shadows=not as_twin and rng.random() < 0.6)
     if as_twin and rng.random() < 0.6:
         return Picture(colour=measure_colour(colour, int(rng.integers(2**31)), 0), labels=labels)
@@ -107,36 +109,54 @@ def draw_scenario(
     actor = stage.named(name)[0]
     stage.put(actor, T_base_object)
     stage.dress_at_random(rng)
-    labels = _see(stage, [actor], "wrist", "pieces")
+    labels = _see(stage, [actor], "wrist", "pieces", by_shape=False)
     return Picture(colour=spoil_photo(stage.draw("wrist", "pieces", shadows=rng.random() < 0.6), rng), labels=labels)
 
 
-def outline_area(corners: list[np.ndarray], T_base_camera: np.ndarray, intrinsics: Intrinsics) -> float:
-    """Return how many pixels parts with those `corners` [(N, 3) in base, each] would cover, nothing hidden.
+def outline(corners: list[np.ndarray], T_base_camera: np.ndarray, intrinsics: Intrinsics) -> np.ndarray | None:
+    """Return what parts with those `corners` [(N, 3) in base, each] would cover, nothing hidden, at half size.
 
-    Pixels up to one picture beyond the border count as well. Infinite when a corner is nearer than 50 mm.
+    The picture is the middle third of what is returned (3 H / 2, 3 W / 2) bool, so that what lies up to one picture
+    beyond its border counts as well. None when a corner is nearer than 50 mm.
     """
     height, width = intrinsics.height, intrinsics.width
-    canvas = np.zeros((3 * height // 2, 3 * width // 2), np.uint8)  # at half size
+    canvas = np.zeros((3 * height // 2, 3 * width // 2), np.uint8)
     R, t = T_base_camera[:3, :3], T_base_camera[:3, 3]
     for points in corners:
         x, y, z = ((points - t) @ R).T
         if z.min() < NEAREST_M:
-            return np.inf
+            return None
         pixels = np.column_stack([x / z * intrinsics.fx + intrinsics.cx, y / z * intrinsics.fy + intrinsics.cy])
         hull = cv2.convexHull(((pixels + np.array([width, height])) / 2).astype(np.float32))
         cv2.fillConvexPoly(canvas, np.round(np.clip(hull, -9999, 9999)).astype(np.int32), 1)
-    return 4.0 * float(canvas.sum())
+    return canvas.astype(bool)
 
 
-def _see(stage: Stage, objects: list[Actor], camera: str, arm: str) -> tuple[Label, ...]:
-    """Return the visible objects' labels; what shows too little is taken off the stage, and the rest seen again."""
+def seen_share(mask: np.ndarray, whole: np.ndarray) -> float:
+    """Return which share of an `outline` the visible pixels `mask` (H, W) bool show."""
+    height, width = mask.shape[0] // 2, mask.shape[1] // 2
+    inside = whole[height : 2 * height, width : 2 * width]
+    return np.count_nonzero(inside & mask[::2, ::2]) / max(np.count_nonzero(whole), 1)
+
+
+def _see(stage: Stage, objects: list[Actor], camera: str, arm: str, *, by_shape: bool) -> tuple[Label, ...]:
+    """Return the visible objects' labels; what shows too little is taken off the stage, and the rest seen again.
+
+    Args:
+        stage: with everything in its place.
+        objects: those that may have a label.
+        camera: `wrist` or `free`.
+        arm: as `Stage.draw` takes it.
+        by_shape: the objects' colours say nothing, so that shape alone must tell what they are.
+    """
     shown = list(objects)
     T_base_camera = stage.T_base_camera(camera)
     while True:
         instances = stage.draw_instances(camera, arm)
         pixels = {id(actor): instances == stage.actors.index(actor) for actor in shown}
-        hardly = [actor for actor in shown if _shows_too_little(stage, actor, pixels[id(actor)], T_base_camera)]
+        hardly = [
+            actor for actor in shown if _shows_too_little(stage, actor, pixels[id(actor)], T_base_camera, by_shape)
+        ]
         if not hardly:
             return tuple(Label(name=actor.prop.kind, mask=pixels[id(actor)]) for actor in shown)
         for actor in hardly:
@@ -144,13 +164,17 @@ def _see(stage: Stage, objects: list[Actor], camera: str, arm: str) -> tuple[Lab
             shown.remove(actor)
 
 
-def _shows_too_little(stage: Stage, actor: Actor, mask: np.ndarray, T_base_camera: np.ndarray) -> bool:
+def _shows_too_little(stage: Stage, actor: Actor, mask: np.ndarray, T_base_camera: np.ndarray, by_shape: bool) -> bool:
     seen = int(mask.sum())
     if seen < LEAST_PIXELS:
         return True
     pose = stage.pose(actor)
     corners = [points @ pose[:3, :3].T + pose[:3, 3] for points in actor.prop.corners()]
-    area = outline_area(corners, T_base_camera, stage.intrinsics)
-    if np.isinf(area):
+    whole = outline(corners, T_base_camera, stage.intrinsics)
+    if whole is None:
         return True
-    return seen < LEAST_SHARE * area and seen < _LARGE_SHARE * mask.size
+    if by_shape and actor.prop.kind == "bottle":
+        mark = outline(corners[-2:], T_base_camera, stage.intrinsics)  # neck and cap
+        if mark is None or seen_share(mask, mark) < LEAST_MARK_SHARE:
+            return True
+    return seen < LEAST_SHARE * 4 * np.count_nonzero(whole) and seen < _LARGE_SHARE * mask.size

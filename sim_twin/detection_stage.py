@@ -32,6 +32,8 @@ VARIANTS = 3
 """Props of each class beside the nominal one."""
 DISTRACTORS = 14
 _SKINS, _SKIN_PX = 10, 64
+_SKIN_SHARE = 0.35
+"""How many things have a texture; the others have one colour."""
 _FLAT_PX = 256
 _LIGHTS = 3
 _WALLS = 4
@@ -237,7 +239,7 @@ class Stage:
 
     def _dress_geoms(self, geoms: np.ndarray, rng: np.random.Generator) -> None:
         """One skin or one colour for all of them."""
-        if rng.random() < 0.5:
+        if rng.random() < _SKIN_SHARE:
             number = self.model.material(f"skin_{rng.integers(_SKINS)}").id
             self.model.geom_matid[geoms] = number
             self.model.geom_rgba[geoms] = np.append(rng.uniform(0.7, 1.0, 3), 1.0)

@@ -7,11 +7,14 @@ import colorsys
 import cv2
 import numpy as np
 
+_QUIET = 0.75
+"""Share of quiet surfaces: few tables and fewer packages are in loud checks."""
+
 
 def random_rgb(rng: np.random.Generator) -> np.ndarray:
     """Return a colour (3,) in [0, 1]: half of them bright, the others greyish, as things in a room are."""
     saturation = rng.uniform(0.35, 1.0) if rng.random() < 0.5 else rng.uniform(0.0, 0.3)
-    return np.array(colorsys.hsv_to_rgb(rng.random(), saturation, rng.uniform(0.08, 1.0)))
+    return np.array(colorsys.hsv_to_rgb(rng.random(), saturation, rng.uniform(0.12, 1.0)))
 
 
 def random_texture(rng: np.random.Generator, size: int) -> np.ndarray:
@@ -19,7 +22,7 @@ def random_texture(rng: np.random.Generator, size: int) -> np.ndarray:
     kind = _KINDS[rng.integers(len(_KINDS))]
     share = kind(rng, size)[..., None]
     low, high = random_rgb(rng), random_rgb(rng)
-    if rng.random() < 0.5:  # a quiet surface: both colours alike
+    if rng.random() < _QUIET:  # both colours alike
         high = np.clip(low + rng.normal(0.0, 0.08, 3), 0.0, 1.0)
     picture = low + (high - low) * share
     if rng.random() < 0.5:
@@ -104,4 +107,4 @@ def _print(rng: np.random.Generator, size: int) -> np.ndarray:
     return picture
 
 
-_KINDS = (_plain, _clouds, _gradient, _checker, _stripes, _wood, _wood, _speckle, _print)
+_KINDS = (_plain, _plain, _clouds, _gradient, _checker, _stripes, _wood, _wood, _speckle, _print)

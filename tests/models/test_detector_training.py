@@ -1,6 +1,5 @@
-"""How the detector learns: what cards hide, what the loss is, and that a phase goes on where it stopped."""
+"""How the detector learns: what the loss is, and that a phase goes on where it stopped."""
 
-import random
 from pathlib import Path
 
 import cv2
@@ -14,66 +13,10 @@ import torch
 from models.detector_training import (
     AUGMENTATION,
     Bf16SegmentationModel,
-    HideBehindCard,
     Phase,
-    clip_polygon,
     read_checkpoint,
     train_phase,
 )
-
-SQUARE = np.array([[0.0, 0.0], [10.0, 0.0], [10.0, 10.0], [0.0, 10.0]])
-
-
-def area(corners: np.ndarray) -> float:
-    x, y = corners.T
-    return 0.5 * abs(float(x @ np.roll(y, 1) - y @ np.roll(x, 1)))
-
-
-def test_a_polygon_is_cut_along_the_line() -> None:
-    half = clip_polygon(SQUARE, np.array([1.0, 0.0]), 4.0)
-    assert area(half) == pytest.approx(40.0)
-    assert half[:, 0].max() == pytest.approx(4.0)
-    diagonal = np.array([1.0, 1.0]) / np.sqrt(2)
-    assert area(clip_polygon(SQUARE, diagonal, 10.0 / np.sqrt(2))) == pytest.approx(50.0)
-    assert clip_polygon(SQUARE, np.array([1.0, 0.0]), 99.0) == pytest.approx(SQUARE)
-    assert len(clip_polygon(SQUARE, np.array([1.0, 0.0]), -1.0)) == 0
-
-
-def test_a_card_hides_part_of_the_only_object_and_its_label_shrinks_as_much() -> None:
-    from ultralytics.utils.instance import Instances
-
-    outline = np.array([[100 + 60 * np.cos(a), 120 + 90 * np.sin(a)] for a in np.linspace(0, 2 * np.pi, 400)])
-    random.seed(1)
-    changed = 0
-    for _ in range(60):
-        image = np.full((240, 320, 3), 255, np.uint8)
-        cv2.fillPoly(image, [outline.astype(np.int32)], (7, 7, 7))
-        box = np.array([[*outline.min(axis=0), *outline.max(axis=0)]], dtype=np.float32)
-        instances = Instances(box, outline[None].astype(np.float32), None, bbox_format="xyxy", normalized=False)
-        labels = HideBehindCard()({"img": image.copy(), "instances": instances})
-        after = labels["instances"]
-        if np.array_equal(labels["img"], image):
-            assert np.array_equal(after.segments[0], outline.astype(np.float32))
-            continue
-        changed += 1
-        shows = np.zeros(image.shape[:2], np.uint8)
-        cv2.fillPoly(shows, [after.segments[0].astype(np.int32)], 1)
-        inside = cv2.erode(shows, np.ones((7, 7), np.uint8)).astype(bool)
-        assert (labels["img"][inside] == 7).all()  # the card covers nothing of what the label keeps
-        assert after.bboxes[0] == pytest.approx([*after.segments[0].min(axis=0), *after.segments[0].max(axis=0)], abs=1)
-    assert 4 <= changed <= 25
-
-
-def test_two_objects_are_left_alone() -> None:
-    from ultralytics.utils.instance import Instances
-
-    segments = np.stack([np.resize(SQUARE, (20, 2)), np.resize(SQUARE + 20, (20, 2))]).astype(np.float32)
-    boxes = np.array([[0, 0, 10, 10], [20, 20, 30, 30]], dtype=np.float32)
-    image = np.zeros((64, 64, 3), np.uint8)
-    for _ in range(20):
-        labels = {"img": image, "instances": Instances(boxes, segments, None, bbox_format="xyxy", normalized=False)}
-        assert len(HideBehindCard()(labels)["instances"]) == 2
-        assert not labels["img"].any()
 
 
 def test_the_loss_in_bfloat16_is_the_loss_but_for_rounding() -> None:

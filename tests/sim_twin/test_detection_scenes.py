@@ -9,14 +9,16 @@ from gl_here import needs_egl
 
 from hal import z1
 from sim_twin.d405 import INTRINSICS
-from sim_twin.detection_props import CLASSES, make_class_prop, make_distractor, nominal_prop
+from sim_twin.detection_props import CLASSES, HIDDEN_GROUP, make_class_prop, make_distractor, nominal_prop
 from sim_twin.detection_scenes import (
+    LEAST_MARK_SHARE,
     LEAST_PIXELS,
     LEAST_SHARE,
     SceneMix,
     draw_scenario,
     draw_scene,
-    outline_area,
+    outline,
+    seen_share,
 )
 from sim_twin.detection_stage import Stage
 from sim_twin.objects import OBJECTS
@@ -121,18 +123,44 @@ def test_every_label_shows_enough_of_its_outline(stage: Stage) -> None:
             for actor in stage.named(label.name):
                 pose = stage.pose(actor)
                 corners = [points @ pose[:3, :3].T + pose[:3, 3] for points in actor.prop.corners()]
-                areas.append(outline_area(corners, camera, stage.intrinsics))
+                whole = outline(corners, camera, stage.intrinsics)
+                areas.append(np.inf if whole is None else 4 * whole.sum())
             assert label.mask.sum() >= min(LEAST_SHARE * min(areas), 0.08 * label.mask.size)
+
+
+@needs_egl
+def test_a_bottle_without_its_neck_has_no_label_where_colours_tell_nothing(stage: Stage) -> None:
+    """Its shoulder cut off by the picture's border, a bottle in random colours is a cylinder."""
+    seen = {True: 0, False: 0}
+    for seed in range(40, 100):
+        rng = np.random.default_rng(seed)
+        picture = draw_scene(stage, rng, SceneMix(empty=0.0, twin_look=0.0, wrist=0.0, occluded=0.0))
+        camera = stage.T_base_camera("free")
+        shown = [a for a in stage.named("bottle") if stage.model.geom_group[a.geoms[0]] != HIDDEN_GROUP]
+        masks = [label.mask for label in picture.labels if label.name == "bottle"]
+        for actor, mask in zip(shown, masks, strict=True) if len(shown) == len(masks) == 1 else []:
+            pose = stage.pose(actor)
+            corners = [points @ pose[:3, :3].T + pose[:3, 3] for points in actor.prop.corners()[-2:]]
+            neck = outline(corners, camera, stage.intrinsics)
+            assert neck is not None
+            seen[seen_share(mask, neck) >= LEAST_MARK_SHARE] += 1
+    assert seen[True] >= 5
+    assert seen[False] == 0
 
 
 def test_the_outline_of_a_plate_square_to_the_camera_is_its_size_in_pixels() -> None:
     plate = np.array([[x, y, 0.5] for x in (-0.05, 0.05) for y in (-0.03, 0.03)])
     wanted = 0.10 * INTRINSICS.fx / 0.5 * 0.06 * INTRINSICS.fy / 0.5
-    assert outline_area([plate], np.eye(4), INTRINSICS) == pytest.approx(wanted, rel=0.06)
+    whole = outline([plate], np.eye(4), INTRINSICS)
+    assert whole is not None
+    assert 4 * whole.sum() == pytest.approx(wanted, rel=0.06)
+    mask = np.zeros((INTRINSICS.height, INTRINSICS.width), dtype=bool)
+    mask[:, : round(INTRINSICS.cx)] = True
+    assert seen_share(mask, whole) == pytest.approx(0.5, abs=0.02)
 
 
 def test_what_comes_too_near_the_lens_has_no_outline() -> None:
-    assert outline_area([np.array([[0.0, 0.0, 0.03], [0.0, 0.1, 0.3]])], np.eye(4), INTRINSICS) == np.inf
+    assert outline([np.array([[0.0, 0.0, 0.03], [0.0, 0.1, 0.3]])], np.eye(4), INTRINSICS) is None
 
 
 def test_props_keep_the_proportions_that_tell_them_from_distractors() -> None:
