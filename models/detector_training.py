@@ -10,6 +10,7 @@ from models.detector_weights import ARCHITECTURE, new_network, tame_ultralytics
 tame_ultralytics()  # before ultralytics is loaded
 
 import torch  # noqa: E402
+import ultralytics.utils  # noqa: E402
 from torch import distributed  # noqa: E402
 from ultralytics.models.yolo.segment import SegmentationTrainer  # noqa: E402
 from ultralytics.nn.tasks import SegmentationModel  # noqa: E402
@@ -129,8 +130,8 @@ class CpuSegmentationTrainer(SegmentationTrainer):
 def train_phase(phase: Phase, *, data: Path, folder: Path, start: Path | None, seed: int, threads: int) -> Path:
     """Train one phase, or what is left of it, and return its last checkpoint.
 
-    Where a process group of torch.distributed is there (RANK and LOCAL_RANK set before ultralytics is imported), its
-    processes share each batch.
+    Where a process group of torch.distributed is there (RANK, LOCAL_RANK and WORLD_SIZE set before ultralytics is
+    imported), its processes share each batch.
 
     Args:
         phase: what to do.
@@ -151,6 +152,8 @@ def train_phase(phase: Phase, *, data: Path, folder: Path, start: Path | None, s
     settings |= {"warmup_bias_lr": 0.0, "deterministic": True, "resume": str(last) if last.exists() else False}
     settings["batch"] = phase.batch // (distributed.get_world_size() if distributed.is_initialized() else 1)
     settings["cache"] = "ram"  # the pictures at the phase's size: 0.7 to 3 GB
+    if distributed.is_initialized() and distributed.get_rank() != ultralytics.utils.RANK:
+        raise RuntimeError("ultralytics does not know of the other processes, so each would see all pictures.")
     trainer = CpuSegmentationTrainer(overrides=settings)
     trainer.add_callback("on_train_start", lambda _: torch.set_num_threads(threads))
     trainer.world_size = 1 if distributed.is_initialized() else 0  # gradients are averaged here, not summed there

@@ -72,7 +72,8 @@ def _train_together(config: Config) -> None:
 
 
 def _train_as_peer(rank: int, config: Config, rendezvous: str) -> None:
-    os.environ |= {"RANK": str(rank), "LOCAL_RANK": str(rank)}  # ultralytics reads them when it is imported
+    ranks = {"RANK": str(rank), "LOCAL_RANK": str(rank), "WORLD_SIZE": str(config.processes)}
+    os.environ |= ranks  # ultralytics reads them when it is imported, and deals the pictures out by them
     from torch import distributed
 
     distributed.init_process_group("gloo", init_method=rendezvous, rank=rank, world_size=config.processes)
