@@ -5,7 +5,7 @@ The file is YAML of plain numbers; reading it needs nothing but this module, and
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -187,14 +187,22 @@ def _content(path: Path) -> Mapping[str, Any]:
 
 def _ranking(data: Any) -> Ranking:
     values = _known(data, Ranking)
+    for key, value in values.items():
+        allowed = _TYPES.get(key, (int, float))
+        if key != "head" and (not isinstance(value, allowed) or isinstance(value, bool) != (bool in allowed)):
+            raise ValueError(f"{key} is {value!r}; it must be of type {allowed[-1].__name__}.")
     if values.get("head") is not None:
-        head = _known(values["head"], ScoringHead)
-        listed = {key: tuple(value) for key, value in head.items() if isinstance(value, Sequence)}
-        values["head"] = ScoringHead(**{**head, **listed})
-    for key, kind in (("k_faces", int), ("hard_filter", bool)):
-        if key in values and type(values[key]) is not kind:
-            raise ValueError(f"{key} is {values[key]!r}; it must be of type {kind.__name__}.")
+        values["head"] = _head(_known(values["head"], ScoringHead))
     return Ranking(**values)
+
+
+_TYPES = {"k_faces": (int,), "hard_filter": (bool,), "box_method": (str,)}
+
+
+def _head(values: Mapping[str, Any]) -> ScoringHead:
+    columns = {key: tuple(float(value) for value in values[key]) for key in ("mean", "scale", "coefficients")}
+    features = tuple(str(name) for name in values["features"])
+    return ScoringHead(features=features, intercept=float(values["intercept"]), **columns)
 
 
 def _known(data: Any, kind: type) -> dict[str, Any]:

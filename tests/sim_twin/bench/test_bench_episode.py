@@ -1,5 +1,6 @@
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from sim_twin.bench.episode import run_scenario
@@ -10,6 +11,7 @@ from sim_twin.bench.trial import Mode, Robot, look
 from sim_twin.scene import SceneConfig
 from z1_runtime.assembly import make_decider
 from z1_runtime.config import RuntimeConfig
+from z1_runtime.scoring_features import FEATURES
 
 CONFIG = RuntimeConfig(generator="antipodal", detector="tabletop", n_candidates=400)
 SCENARIO = Scenario(object="cylinder", distance="mid", lateral="centre", pitch_deg=0.0)
@@ -46,6 +48,16 @@ def test_a_row_says_which_candidate_was_taken_and_why(rows):
     assert len(mvb["faces"]) == 2
     assert len(mvb["face_normals"]) == 6
     assert mvb["success_top1"] == (mvb["success"] and mvb["rank"] == 0)
+
+
+def test_a_row_holds_what_a_scoring_head_is_fitted_to(rows, decider):
+    for row in rows:
+        grasp, first = ([row[f"{which}_{name}"] for name in FEATURES] for which in ("grasp", "first"))
+        assert np.isfinite(grasp).all()
+        assert (grasp == first) == (row["rank"] == 0)
+        assert row["grasp_generator"] == row["generator_score"]
+        assert row["grasp_down"] == pytest.approx(-np.reshape(row["T_base_grasp"], (4, 4))[2, 2], abs=0.03)
+    assert rows[1]["first_candidate"] == rows[1]["candidate"] or rows[1]["rank"] > 0
 
 
 def test_an_object_that_is_not_where_it_was_seen_is_not_called_lifted(decider):
