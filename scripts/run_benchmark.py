@@ -227,8 +227,13 @@ def _print(console: Console, summary: dict[str, Any]) -> None:
         first, second = pair["methods"]
         console.print(
             f"{pair['reading']}: only {first} {pair['only_first']}, only {second} {pair['only_second']} of "
-            f"{pair['scenarios']}, McNemar p = {pair['p']:.2g}"
+            f"{pair['scenarios']}, {100 * pair['difference']:+.1f} points ({_points(pair['difference_95'])}), "
+            f"McNemar p = {pair['p']:.2g}"
         )
+
+
+def _points(interval: tuple[float, float]) -> str:
+    return f"{100 * interval[0]:+.1f} to {100 * interval[1]:+.1f}"
 
 
 def _interval(interval: tuple[float, float]) -> str:

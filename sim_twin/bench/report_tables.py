@@ -114,12 +114,16 @@ def paired(pairs: Sequence[Mapping[str, Any]]) -> str:
             str(pair["scenarios"]),
             str(pair["only_first"]),
             str(pair["only_second"]),
+            f"{100 * pair['difference']:+.1f}",
+            "{:+.1f} to {:+.1f}".format(*(100 * bound for bound in pair["difference_95"])),
             f"{pair['p']:.2g}",
         ]
         for pair in pairs
     ]
-    head = ["reading", "first and second", "scenarios", "only first", "only second", "p"]
-    return table(head, lines) + _note("On the same scenarios and candidates; p: McNemar, exact, two-sided.")
+    head = ["reading", "first and second", "scenarios", "only first", "only second", "points", "95 %", "p"]
+    return table(head, lines) + _note(
+        "On the same scenarios and candidates; p: McNemar, exact, two-sided; interval: Newcombe 1998, method 10."
+    )
 
 
 def candidates(own: Mapping[str, Sequence[Row]]) -> str:

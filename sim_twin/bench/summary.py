@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from sim_twin.bench.rows import Row
-from sim_twin.bench.stats import mcnemar, wilson
+from sim_twin.bench.stats import mcnemar, paired_difference, wilson
 
 CONDITIONS = ("object", "distance", "lateral", "pitch_deg", "occlusion", "clutter", "physics_noise")
 """Columns by which success is broken down."""
@@ -91,7 +91,8 @@ def _compare(a: str, b: str, by_method: dict[str, list[Row]], reading: str) -> d
     column = _READINGS[reading]
     first, second = ({row["scenario"]: row[column] for row in by_method[name]} for name in (a, b))
     shared = [scenario for scenario in first if scenario in second]
-    test = mcnemar(np.array([first[s] for s in shared]), np.array([second[s] for s in shared]))
+    ours, theirs = np.array([first[s] for s in shared]), np.array([second[s] for s in shared])
+    test = mcnemar(ours, theirs)
     return {
         "methods": [a, b],
         "reading": reading,
@@ -99,6 +100,8 @@ def _compare(a: str, b: str, by_method: dict[str, list[Row]], reading: str) -> d
         "only_first": test.only_first,
         "only_second": test.only_second,
         "p": test.p,
+        "difference": (test.only_first - test.only_second) / len(shared) if shared else float("nan"),
+        "difference_95": paired_difference(ours, theirs) if shared else (float("nan"), float("nan")),
     }
 
 
