@@ -35,7 +35,7 @@ _CHANGES = {"train": {"crowd": 0.75, "empty": 0.05}, "empty": {"empty": 1.0}}
 class Config:
     """How many pictures, and of what."""
 
-    train: int = 6000
+    train: int = 5000
     """Pictures to learn from."""
     val: int = 500
     """Held-out pictures."""

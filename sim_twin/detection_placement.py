@@ -87,13 +87,12 @@ def _hand_is_clear_of_table(stage: Stage) -> bool:
     return bool(points[:, 2].min() > 0.012)
 
 
-def choose_objects(stage: Stage, rng: np.random.Generator, *, as_twin: bool, crowd: bool) -> list[Actor]:
-    """One to three objects, or up to eight; in the twin's look always the benchmark's own three."""
+def choose_objects(stage: Stage, rng: np.random.Generator, *, nominal: float, crowd: bool) -> list[Actor]:
+    """One to three objects, or up to eight; a share of `nominal` of them are the benchmark's own."""
     chosen: list[Actor] = []
-    for _ in range(rng.integers(4, 9) if crowd else rng.choice([1, 2, 3], p=[0.55, 0.3, 0.15])):
+    for _ in range(rng.integers(6, 12) if crowd else rng.choice([1, 2, 3], p=[0.55, 0.3, 0.15])):
         actors = stage.named(str(rng.choice(CLASSES)))
-        nominal = as_twin or rng.random() < 0.35
-        actor = actors[0] if nominal else actors[rng.integers(1, len(actors))]
+        actor = actors[0] if rng.random() < nominal else actors[rng.integers(1, len(actors))]
         if actor not in chosen:
             chosen.append(actor)
     return chosen

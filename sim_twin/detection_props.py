@@ -152,7 +152,7 @@ def _make_stick(rng: np.random.Generator) -> Prop:
 
 def _make_angle(rng: np.random.Generator) -> Prop:
     """An L, a T or a cross of two bars."""
-    long, short, half = rng.uniform(0.05, 0.09), rng.uniform(0.025, 0.05), rng.uniform(0.006, 0.012)
+    long, short, half = rng.uniform(0.05, 0.09), rng.uniform(0.025, 0.05), rng.uniform(0.005, 0.009)
     across = _part("box", (short, half, half))
     up = _part("box", (half, half, long))
     side, height = [(short - half, -long + half), (0.0, long - half), (0.0, 0.3 * long)][rng.integers(3)]

@@ -66,12 +66,14 @@ class SceneMix:
     """No object at all, only distractors or nothing."""
     wrist: float = 0.85
     """Seen by the wrist camera past the jaws; the others from anywhere."""
-    twin_look: float = 0.35
+    twin_look: float = 0.4
     """In the twin's own colours and light."""
+    nominal: float = 0.75
+    """Share of the objects with the benchmark's own measures; in the twin's look all have them."""
     occluded: float = 0.2
     """Something put in front of the first object on purpose."""
     crowd: float = 0.0
-    """Four to eight objects instead of one to three: more to learn from a picture."""
+    """Up to eight objects instead of one to three: more to learn from a picture."""
 
 
 def draw_scene(stage: Stage, rng: np.random.Generator, mix: SceneMix | None = None) -> Picture:
@@ -84,7 +86,11 @@ def draw_scene(stage: Stage, rng: np.random.Generator, mix: SceneMix | None = No
     camera = "wrist" if by_wrist else "free"
     T_base_camera, centre = place_camera(stage, by_wrist, rng)
     crowd = mix.crowd > 0.0 and rng.random() < mix.crowd
-    objects = [] if rng.random() < mix.empty else choose_objects(stage, rng, as_twin=as_twin, crowd=crowd)
+    objects = (
+        []
+        if rng.random() < mix.empty
+        else choose_objects(stage, rng, nominal=1.0 if as_twin else mix.nominal, crowd=crowd)
+    )
     places = place_objects(stage, objects, T_base_camera, centre=centre, by_wrist=by_wrist, crowd=crowd, rng=rng)
     place_distractors(stage, places, T_base_camera, centre, rng)
     if places and rng.random() < mix.occluded:
