@@ -9,11 +9,12 @@ import numpy as np
 from models.types import GraspSet
 from z1_runtime.arm_collision import Problem
 from z1_runtime.collision import CollisionChecker
-from z1_runtime.fitting import fit_grasps, make_room
+from z1_runtime.fitting import fit_grasps, make_room, measure_support
 from z1_runtime.gripper import BeakBatch, BeakGripper
 
 _CHUNK = 48
 _MAX_SHAPE_POINTS = 1000
+_ELSEWHERE_M = 0.003
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -65,7 +66,7 @@ class Candidates:
         self.widths_m = np.array(ranked.widths_m, dtype=np.float64)
         """(N,) as given, or measured in the cloud once the candidate was fitted [m]."""
         self.support = np.full(len(ranked), np.nan)
-        """(N,) share of the pads that the object fills, in [0, 1], once the candidate was fitted."""
+        """(N,) share of the pads that what is seen of the object fills, in [0, 1], once the candidate was fitted."""
         self.level = np.full(len(ranked), np.nan)
         """(N,) 1 where the jaws' push is level, 0 where friction just holds, once the candidate was fitted."""
         self._fronts_m = np.full(len(ranked), np.nan)
@@ -131,35 +132,52 @@ class Candidates:
         self._chunks[chunk] = batch, problems
 
     def _measure(self, part: slice) -> np.ndarray:
-        """Fill in what the object's points say of the grasps in `part`; return them (n, 4, 4) with room for the rest
-        of the object where its sight was blocked."""
-        beak = self._gripper.config
-        fit = fit_grasps(
-            self._T_base_grasps[part], self.widths_m[part], self._shape_points, beak.contact_depth_m, beak.unseen_m
-        )
-        widths = np.where(np.isfinite(fit.widths_m), fit.widths_m, self._fallback_width_m)
-        self._fronts_m[part], self.support[part] = fit.fronts_m, fit.support
-        T_base_grasps = self._T_base_grasps[part].copy()
-        T_base_grasps[:, :3, 3] += fit.shifts_m[:, None] * T_base_grasps[:, :3, 1]
-        T_base_grasps, self.widths_m[part] = make_room(
-            T_base_grasps, widths, self._checker.hidden_points, beak.contact_depth_m
-        )
-        return self._deepened(T_base_grasps, part)
+        """Fill in what the object's points say of the grasps in `part`; return them (n, 4, 4), moved to the middle of
+        the object and on along their approach, with room for what is hidden.
 
-    def _deepened(self, T_base_grasps: np.ndarray, part: slice) -> np.ndarray:
-        """Return the grasps moved on along their approach to where the object is as wide as it gets.
+        Where jaws and palm cannot hold the object where it was asked, it is measured again where they can.
+        """
+        Ts, given = self._T_base_grasps[part], self.widths_m[part].copy()
+        T_base_grasps, widths, fronts = self._middled(Ts, given)
+        deeper, setback = self._along(T_base_grasps, widths, fronts)
+        away = deeper - setback
+        moved = np.abs(away) > _ELSEWHERE_M
+        if moved.any():
+            there, widths[moved], _ = self._middled(_advanced(Ts[moved], away[moved]), given[moved])
+            T_base_grasps[moved] = _advanced(there, -away[moved])
+        self.widths_m[part], self._fronts_m[part] = widths, fronts + deeper
+        self.support[part] = measure_support(
+            _advanced(T_base_grasps, away), widths, self._shape_points, self._gripper.config.contact_depth_m
+        )
+        return _advanced(T_base_grasps, deeper)
+
+    def _middled(self, Ts: np.ndarray, given_m: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return grasps (n, 4, 4) moved along y to the middle of what is between their pads, its width (n,), and how
+        far it reaches towards the palm (n,) [m]; widths `given_m` (n,) may be NaN."""
+        beak = self._gripper.config
+        fit = fit_grasps(Ts, given_m, self._shape_points, beak.contact_depth_m, beak.unseen_m)
+        widths = np.where(np.isfinite(fit.widths_m), fit.widths_m, self._fallback_width_m)
+        middled = Ts.copy()
+        middled[:, :3, 3] += fit.shifts_m[:, None] * Ts[:, :3, 1]
+        return *make_room(middled, widths, self._checker.hidden_points, beak.contact_depth_m), fit.fronts_m
+
+    def _along(self, Ts: np.ndarray, widths_m: np.ndarray, fronts_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return how far (n,) grasps move on along their approach, to where the object is as wide as it gets, and how
+        far (n,) they are set back for the palm's sake [m].
 
         A round object reaches half its width towards the palm; where less of it is seen, the contacts lie before its
         middle, and the jaws would push it out. The table bounds how far the jaws can go.
         """
-        widths, fronts = self.widths_m[part], self._fronts_m[part]
-        batch = self._gripper.fit_batch(T_base_grasps, widths, fronts)
+        batch = self._gripper.fit_batch(Ts, widths_m, fronts_m)
         spare = self._checker.spare_height_m(batch.T_base_pivots.reshape(-1, 4, 4), np.repeat(batch.jaw_open, 2))
-        down = np.maximum(-T_base_grasps[:, :3, 2] @ self._checker.table.normal, 1e-3)
+        down = np.maximum(-Ts[:, :3, 2] @ self._checker.table.normal, 1e-3)
         room = spare.reshape(-1, 2).max(axis=1) / down
         most = np.minimum(self._gripper.config.max_deepening_m, np.maximum(room, 0.0))
-        deeper = np.clip(0.5 * widths - fronts, 0.0, most)
-        self._fronts_m[part] = fronts + deeper
-        moved = T_base_grasps.copy()
-        moved[:, :3, 3] += deeper[:, None] * T_base_grasps[:, :3, 2]
-        return moved
+        return np.clip(0.5 * widths_m - fronts_m, 0.0, most), batch.setback_m
+
+
+def _advanced(Ts: np.ndarray, by_m: np.ndarray) -> np.ndarray:
+    """Return grasps (n, 4, 4) moved along their approach by `by_m` (n,) [m]."""
+    moved = Ts.copy()
+    moved[:, :3, 3] += by_m[:, None] * Ts[:, :3, 2]
+    return moved

@@ -15,6 +15,7 @@ _FRONT_SHARE = 0.01  # of the points between: one speckle shall not push the who
 _EDGE_SHARE = 0.01
 _SEEN_M = 0.005
 _PUSHED_M = 0.006  # what stands out further than this is no error of the middle
+_GROWTHS, _GROWN_M = 3, 0.001  # times that what then stands beside is looked at again, if the middle moved this far
 _WIDTH_Z_M, _WIDTH_Y_M = 0.025, 0.06
 _PAD_Z_M = 0.012
 _STRIPS = 5
@@ -32,8 +33,6 @@ class Fit(NamedTuple):
     """(N,) how far the object reaches towards the palm [m]."""
     shifts_m: np.ndarray
     """(N,) how far along y the grasp must move for its width to hold all that is seen between the pads [m]."""
-    support: np.ndarray
-    """(N,) share of the pads' width, in [0, 1], along which the object is as wide as the width says."""
 
 
 def fit_grasps(
@@ -50,6 +49,17 @@ def fit_grasps(
     """
     T, widths, cloud = (np.ascontiguousarray(array, dtype=np.float64) for array in (T_base_grasps, widths_m, points))
     return Fit(*_fit(T, widths, cloud, contact_depth_m, unseen_m))
+
+
+def measure_support(
+    T_base_grasps: np.ndarray, widths_m: np.ndarray, points: np.ndarray, contact_depth_m: float
+) -> np.ndarray:
+    """Return the share (N,) of the pads' width, in [0, 1], along which a point is seen where a pad will press.
+
+    A contact that was only supposed, on a side that nothing shows, supports nothing. Arguments as in `fit_grasps`.
+    """
+    T, widths, cloud = (np.ascontiguousarray(array, dtype=np.float64) for array in (T_base_grasps, widths_m, points))
+    return _support(T, widths, cloud, contact_depth_m)
 
 
 def make_room(
@@ -81,7 +91,7 @@ def _local(T, p, contact_depth_m):
 @njit(cache=True)
 def _fit(T, given, points, contact_depth_m, unseen_m):  # noqa: PLR0912 - one pass over all points for each grasp
     n = len(T)
-    widths, fronts, shifts, support = given.copy(), np.zeros(n), np.zeros(n), np.zeros(n)
+    widths, fronts, shifts = given.copy(), np.zeros(n), np.zeros(n)
     local, between, aside = np.empty((len(points), 3)), np.empty(len(points)), np.empty(len(points))
     for g in range(n):
         widest = np.nan
@@ -93,42 +103,55 @@ def _fit(T, given, points, contact_depth_m, unseen_m):  # noqa: PLR0912 - one pa
                 widest = abs(y)
         if np.isnan(widths[g]):
             widths[g] = 2.0 * widest
-        half, count = 0.5 * widths[g], 0
-        for m in range(len(points)):
-            x, y, z = local[m]
-            if abs(x) < PAD_HALF_WIDTH_M and abs(z) < _PAD_Z_M and abs(y) < half + _PUSHED_M:
-                aside[count] = y
-                count += 1
-        if count:
+        half, shift, low, high = 0.5 * widths[g], 0.0, np.nan, np.nan
+        for _ in range(_GROWTHS):
+            count = 0
+            for m in range(len(points)):
+                x, y, z = local[m]
+                if abs(x) < PAD_HALF_WIDTH_M and abs(z) < _PAD_Z_M and abs(y - shift) < half + _PUSHED_M:
+                    aside[count] = y
+                    count += 1
+            if not count:
+                break
             across = np.sort(aside[:count])
             skipped = int(_EDGE_SHARE * count)
             low, high = across[skipped], across[count - 1 - skipped]
             half = max(half, 0.5 * (high - low))
-            shifts[g] = max(high - half, 0.0) - max(-half - low, 0.0)
-            above = unseen_m * (high < shifts[g] + half - _SEEN_M)
-            below = unseen_m * (low > shifts[g] - half + _SEEN_M)
+            moved = max(high - shift - half, 0.0) - max(shift - half - low, 0.0)
+            shift += moved
+            if abs(moved) < _GROWN_M:
+                break
+        if not np.isnan(low):
+            above = unseen_m * (high < shift + half - _SEEN_M)
+            below = unseen_m * (low > shift - half + _SEEN_M)
             half += 0.5 * (above + below)
-            shifts[g] += 0.5 * (above - below)
-            widths[g] = 2.0 * half
-        count, strips = 0, np.full(_STRIPS, -1.0)
+            widths[g], shifts[g] = 2.0 * half, shift + 0.5 * (above - below)
+        count = 0
         for m in range(len(points)):
             x, y, z = local[m]
-            y = abs(y - shifts[g])
-            if abs(x) < _PALM_HALF_WIDTH_M and y < half + _ASIDE_M:
+            if abs(x) < _PALM_HALF_WIDTH_M and abs(y - shifts[g]) < half + _ASIDE_M:
                 between[count] = z
                 count += 1
-            if abs(x) < PAD_HALF_WIDTH_M and abs(z) < _PAD_Z_M:
-                strip = int((x / PAD_HALF_WIDTH_M + 1.0) / 2.0 * _STRIPS)
-                strips[strip] = max(strips[strip], min(y, half))
         if count:
             nearest = np.sort(between[:count])[int(_FRONT_SHARE * count)]
             fronts[g] = max(-nearest, 0.0)
-        filled = 0.0
+    return widths, fronts, shifts
+
+
+@njit(cache=True)
+def _support(T, widths, points, contact_depth_m):
+    support = np.zeros(len(T))
+    for g in range(len(T)):
+        half, strips = 0.5 * widths[g], np.full(_STRIPS, -1.0)
+        for m in range(len(points)):
+            x, y, z = _local(T[g], points[m], contact_depth_m)
+            if abs(x) < PAD_HALF_WIDTH_M and abs(z) < _PAD_Z_M:
+                strip = int((x / PAD_HALF_WIDTH_M + 1.0) / 2.0 * _STRIPS)
+                strips[strip] = max(strips[strip], min(abs(y), half))
         for strip in range(_STRIPS):
             if strips[strip] >= 0.0:
-                filled += max(1.0 - (half - strips[strip]) / _STRIP_GAP_M, 0.0)
-        support[g] = filled / _STRIPS
-    return widths, fronts, shifts, support
+                support[g] += max(1.0 - (half - strips[strip]) / _STRIP_GAP_M, 0.0) / _STRIPS
+    return support
 
 
 @njit(cache=True)
@@ -150,4 +173,5 @@ def warm_up() -> None:
     """Load what is compiled, so that the first fit is as fast as the next."""
     one = np.eye(4)[None]
     fit_grasps(one, np.array([0.05]), np.zeros((1, 3)), 0.0)
+    measure_support(one, np.array([0.05]), np.zeros((1, 3)), 0.0)
     make_room(one, np.array([0.05]), np.zeros((1, 3)), 0.0)

@@ -107,6 +107,8 @@ class BeakBatch:
     """(N, 2, 4, 4) pivot poses once both jaws press."""
     jaw_touch: np.ndarray
     """(N,) [rad]."""
+    setback_m: np.ndarray
+    """(N,) how far before the asked contacts the object is held, so that the palm stays clear of it [m]."""
     level: np.ndarray
     """(N,) 1 where the squeeze does not push the object out, 0 where friction only just holds it."""
     fits: np.ndarray
@@ -192,6 +194,7 @@ class BeakGripper:
             jaw_open=np.maximum(-lay.opened, z1.GRIPPER_OPEN),
             T_base_touches=T_base_pivots @ mover_pose(-lay.turn)[:, None],
             jaw_touch=-lay.pressed,
+            setback_m=lay.setback_m,
             level=np.clip(1.0 - lay.squeeze_out / self._steepest, 0.0, 1.0),
             fits=usable & self._fits(lay),
         )

@@ -83,8 +83,9 @@ def write_report(rows: Sequence[Row], summary: Mapping[str, Any], path: Path) ->
         "in a fresh world, until one lifts the object.</p>",
         f"<div class='cards'><div class='card'>solved<strong>{summary['solved']} of {summary['episodes']}</strong>"
         f"<span>{summary['rate']:.1%} ({low:.1%} to {high:.1%})</span></div></div>",
-        "<h2>By condition</h2>",
-        *(_by_table(column, summary["by"][column]) for column in _BY),
+        "<h2>By condition</h2><div class='row'>",
+        *(f"<div>{_by_table(column, summary['by'][column])}</div>" for column in _BY),
+        "</div>",
         "<h2>Executions it took</h2>" + table(["grasps executed", "solved within them"], within),
         "<h2>Ways that the arm can go</h2><p><small>Of the first sweep, two flips a grasp; below each how many were "
         "executed until one held. As the robot sees it, from its base.</small></p>" + _grids(rows),

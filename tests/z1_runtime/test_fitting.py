@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from z1_runtime.fitting import fit_grasps, make_room
+from z1_runtime.fitting import fit_grasps, make_room, measure_support
 
 RADIUS_M, DEPTH_M = 0.03, 0.012
 
@@ -31,15 +31,34 @@ def test_a_width_that_is_not_known_is_measured():
 
 
 def test_the_front_reaches_a_radius_towards_the_palm_and_the_pads_are_filled():
-    fit = fit_grasps(frontal(), np.array([2 * RADIUS_M]), pillar(), DEPTH_M)
+    widths = np.array([2 * RADIUS_M])
+    fit = fit_grasps(frontal(), widths, pillar(), DEPTH_M)
     assert fit.fronts_m == pytest.approx([RADIUS_M], abs=1e-3)
-    assert fit.support == pytest.approx([1.0], abs=0.05)
+    assert measure_support(frontal(), widths, pillar(), DEPTH_M) == pytest.approx([1.0], abs=0.05)
     assert fit.shifts_m == pytest.approx([0.0], abs=1e-3)
 
 
 def test_a_short_object_fills_little_of_the_pads():
-    fit = fit_grasps(frontal(), np.array([2 * RADIUS_M]), pillar(height_m=0.012), DEPTH_M)
-    assert fit.support[0] < 0.7
+    support = measure_support(frontal(), np.array([2 * RADIUS_M]), pillar(height_m=0.012), DEPTH_M)
+    assert support[0] < 0.7
+
+
+def test_a_contact_that_is_only_supposed_supports_nothing():
+    seen = pillar()[pillar()[:, 1] > -0.5 * RADIUS_M]
+    one_side = measure_support(frontal(), np.array([2 * RADIUS_M]), seen, DEPTH_M)
+    supposed = measure_support(frontal(-0.015), np.array([2 * RADIUS_M + 0.030]), seen, DEPTH_M)
+    neither = measure_support(frontal(), np.array([2 * RADIUS_M + 0.030]), seen, DEPTH_M)
+    assert one_side == pytest.approx([1.0], abs=0.05)
+    assert supposed == pytest.approx([1.0], abs=0.05)
+    assert neither[0] < 0.2
+
+
+def test_what_is_found_beside_once_the_middle_has_moved_moves_it_again():
+    y, z = np.meshgrid(np.arange(-RADIUS_M, RADIUS_M, 0.001), np.arange(-0.02, 0.02, 0.002))
+    face = np.column_stack([np.zeros(y.size), y.ravel(), z.ravel()])
+    fit = fit_grasps(frontal(-0.010), np.array([2 * RADIUS_M]), face, DEPTH_M)
+    assert fit.widths_m == pytest.approx([2 * RADIUS_M], abs=2e-3)
+    assert fit.shifts_m == pytest.approx([0.010], abs=2e-3)
 
 
 @pytest.mark.parametrize("aside_m", [-0.003, 0.003])
