@@ -72,16 +72,16 @@ def draft(
     proposed = [plain] if head is None else [plain, replace(plain, head=head)]
     logged = {ranking: text for text, ranking in rankings.items()}
     proposals = tuple(
-        Proposal(ranking=ranking, method=logged.get(ranking) or _filed(name, ranking, hand, folder), tallies={})
+        Proposal(ranking=ranking, method=logged.get(ranking) or _filed(name, ranking, config, folder), tallies={})
         for ranking in proposed
         if ranking != hand
     )
     return Draft(hand=hand, variants=variants, rankings=rankings, thresholds=thresholds, proposals=proposals)
 
 
-def _filed(name: str, ranking: Ranking, hand: Ranking, folder: Path) -> str:
+def _filed(name: str, ranking: Ranking, config: RuntimeConfig, folder: Path) -> str:
     """Write `ranking` as a scoring file of its own, named by its content; return the method that ranks by it."""
-    both = dict.fromkeys(FAMILIES, hand) | {name: ranking}
+    both = {family: hand_ranking(family, config) for family in FAMILIES} | {name: ranking}
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{name}-{hashlib.sha256(repr(ranking).encode()).hexdigest()[:12]}.yaml"
     save_scoring(Scoring(mvb=both["mvb"], full=both["full"], tuned=(name,), evidence={"proposal": True}), path)

@@ -72,7 +72,7 @@ def threshold_line(key: str, threshold: Threshold | None) -> list[str]:
         return [key, "–", "–", "–", "–", "no cut with more failures below it"]
     (low, n_low), (high, n_high) = threshold.below, threshold.above
     verdict = "proposed" if threshold.holds else "does not hold out of its own fold"
-    return [key, f"{threshold.value:.3g}", f"{low} of {n_low}", f"{high} of {n_high}", f"{threshold.p:.2g}", verdict]
+    return [key, f"{threshold.value:.4g}", f"{low} of {n_low}", f"{high} of {n_high}", f"{threshold.p:.2g}", verdict]
 
 
 THRESHOLD_HEAD = ("threshold", "value", "worked below", "worked above", "Fisher p", "")

@@ -1,5 +1,7 @@
 """What was set by hand stays unless what was fitted wins where it was not fitted."""
 
+from pathlib import Path
+
 import pytest
 from tune_episodes import episode, number_of, scenarios, write_run
 
@@ -127,6 +129,8 @@ def test_a_head_is_proposed_as_a_file_and_taken_when_its_episodes_win(fitted, tm
     assert tuning.scoring.tuned == ("mvb", "full")
     assert len(runs.asked) == 4
     assert all(":scoring=" in name for name in (mvb.proposals[-1].method, full.proposals[-1].method))
+    filed = load_scoring(Path(full.proposals[-1].method.partition("scoring=")[2]))
+    assert (filed.mvb, filed.full) == (mvb.draft.hand, full.kept)
 
     save_scoring(tuning.scoring, tmp_path / "scoring.yaml")
     assert load_scoring(tmp_path / "scoring.yaml") == tuning.scoring
