@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import hashlib
 import os
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import mujoco
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial.transform import Rotation
 
+from sim_twin.objects import OBJECT_BODY, add_object
 from sim_twin.parts import GraspObject, Part
+from sim_twin.z1_mjcf import BIT_SCENE
 
 if TYPE_CHECKING:  # trimesh takes two seconds to import
     import trimesh
@@ -28,6 +33,7 @@ _COACD = {"threshold": 0.05, "max_convex_hull": 32, "decimate": True, "max_ch_ve
 # triangles of it that the cutting takes many minutes.
 _COACD_OPEN = {"preprocess_mode": "off", "resolution": 1000, "mcts_iterations": 60}
 _RGBA = (0.36, 0.52, 0.62, 1.0)
+_PUT_DOWN_RAD, _UPRIGHT_RAD, _TRIAL_STEP_S = float(np.deg2rad(2.0)), float(np.deg2rad(6.0)), 1e-3
 _STANDS_ON_M = 1.5e-3
 """Corners this little above the lowest one count as feet: meshes are seldom quite level."""
 
@@ -148,7 +154,8 @@ def _assemble(path: Path, hulls: list[np.ndarray], mass_kg: float) -> GraspObjec
         for body in bodies
     )
     centre = np.sum([body.volume * _centroid(body) for body in bodies], axis=0) / total
-    return GraspObject(height_m=float(np.ptp(corners[:, 2])), parts=parts, stands=_stands(parts, centre))
+    thing = GraspObject(height_m=float(np.ptp(corners[:, 2])), parts=parts)
+    return thing if _has_feet(parts, centre) and _stays_upright(thing) else replace(thing, stands=False)
 
 
 def _hull(corners: np.ndarray) -> ConvexHull | None:
@@ -166,7 +173,7 @@ def _centroid(body: ConvexHull) -> np.ndarray:
     return ((a + b + c + inner) / 4 * volumes[:, None]).sum(axis=0) / volumes.sum()
 
 
-def _stands(parts: tuple[Part, ...], centre: np.ndarray) -> bool:
+def _has_feet(parts: tuple[Part, ...], centre: np.ndarray) -> bool:
     """Return whether the centre of mass is above the inside of what touches the table."""
     corners = np.vstack([part.corners() for part in parts])
     feet = corners[corners[:, 2] < corners[:, 2].min() + _STANDS_ON_M][:, :2]
@@ -175,3 +182,27 @@ def _stands(parts: tuple[Part, ...], centre: np.ndarray) -> bool:
     except (QhullError, ValueError):
         return False  # a point or an edge
     return bool((base.equations[:, :2] @ centre[:2] + base.equations[:, 2] < -_STANDS_ON_M).all())
+
+
+def _stays_upright(thing: GraspObject) -> bool:
+    """Return whether `thing`, put down a little aslant in either direction, still stands a second later: a round bottom
+    has feet by its corners, and rolls over all the same."""
+    return all(_settled_tilt_rad(thing, axis) < _UPRIGHT_RAD for axis in np.eye(3)[:2])
+
+
+def _settled_tilt_rad(thing: GraspObject, axis: np.ndarray) -> float:
+    """Return how far `thing` leans [rad] after a second on a table where it began turned about `axis` (3,)."""
+    spec = mujoco.MjSpec()
+    spec.option.timestep = _TRIAL_STEP_S
+    spec.worldbody.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_PLANE, size=[1.0, 1.0, 0.1], contype=BIT_SCENE, conaffinity=BIT_SCENE
+    )
+    start = np.eye(4)
+    start[:3, :3] = Rotation.from_rotvec(_PUT_DOWN_RAD * axis).as_matrix()
+    start[2, 3] = -float((thing.corners() @ start[2, :3]).min())
+    add_object(spec, thing, start)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data, nstep=round(1.0 / _TRIAL_STEP_S))
+    up = float(data.body(OBJECT_BODY).xmat[8])
+    return float(np.arccos(np.clip(up, -1.0, 1.0)))

@@ -129,3 +129,12 @@ def test_what_is_no_mesh_is_refused(tmp_path):
     flat = trimesh.Trimesh(np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0.1, 0.1, 0]]), [[0, 1, 2], [1, 3, 2]])
     with pytest.raises(MeshError, match="flat"):
         load_mesh_object(write(tmp_path / "flat.stl", flat), 1.0, 0.1)
+
+
+def test_what_has_a_round_bottom_does_not_stand_though_its_corners_make_feet(tmp_path):
+    pill = trimesh.creation.capsule(height=60.0, radius=24.0)
+    _, thing = load_mesh_object(write(tmp_path / "pill.stl", pill), 1e-3, 0.2)
+    assert not thing.stands
+    tin = trimesh.creation.cylinder(24.0, height=108.0, sections=24)
+    _, thing = load_mesh_object(write(tmp_path / "tin.stl", tin), 1e-3, 0.2)
+    assert thing.stands
