@@ -125,7 +125,9 @@ def _print(console: Console, tuning: Tuning) -> None:
 
     for name, family in tuning.families.items():
         variants = family.draft.variants
-        table = Table(f"{name}: variant", "numbers", *variants.successes, title=f"seeds {tuning.train_seeds}")
+        table = Table(
+            f"{name}: variant", "numbers", *variants.successes, title=f"fitted to seeds {_words(tuning.train_seeds)}"
+        )
         for text in variants.names:
             own = [f"{count[text]} of {variants.scenarios}" for count in variants.successes.values()]
             table.add_row(text, said(family.draft.rankings[text]), *own)
@@ -135,7 +137,7 @@ def _print(console: Console, tuning: Tuning) -> None:
             f"({tuning.reading})"
         )
         _print_table(console, THRESHOLD_HEAD, [threshold_line(*item) for item in family.draft.thresholds.items()])
-        _print_table(console, HELD_OUT_HEAD, held_out_lines(family), f"held-out seeds {tuning.held_out_seeds}")
+        _print_table(console, HELD_OUT_HEAD, held_out_lines(family), f"judged on seeds {_words(tuning.held_out_seeds)}")
     if tuning.head is not None:
         lines = [skill_line("other scenarios", tuning.head.skill)]
         lines += [skill_line(f"{name}, fitted to the others", skill) for name, skill in tuning.head.objects.items()]
@@ -143,6 +145,10 @@ def _print(console: Console, tuning: Tuning) -> None:
     console.print(tuning.head_note)
     for name, family in tuning.families.items():
         console.print(f"[bold]{name}[/bold]: {family.why}")
+
+
+def _words(seeds: Sequence[int]) -> str:
+    return ", ".join(map(str, seeds))
 
 
 def _print_table(console: Console, head: Sequence[str], lines: Sequence[Sequence[str]], title: str = "") -> None:
