@@ -29,8 +29,8 @@ class RuntimeConfig:
     """How a pick is done."""
 
     detector: str = "tabletop"
-    """Which detector: `tabletop` (depth above the table), `yolo` (learned), or `truth` (the twin's mask, for
-    evaluation)."""
+    """Which detector: `tabletop` (whatever rises above the table), `yolo` (learned: bottles, boxes and cylinders), or
+    `truth` (the twin's mask, for evaluation)."""
     detector_weights: str = ""
     """Weights of `yolo`: .npz of ours, .pt of ultralytics, .onnx, OpenVINO's .xml or its folder; empty = ours."""
     detector_runtime: str = "auto"
@@ -39,8 +39,8 @@ class RuntimeConfig:
     """What `yolo` is not surer of than this does not count, in [0, 1)."""
     object_class: str = ""
     """The class to pick, for a detector that knows classes; empty = whatever it is surest of."""
-    generator: str = "antipodal"
-    """Which grasp generator: `antipodal`, `obb_sweep` (no learning), `diffusion` (the learned one that ships),
+    generator: str = "diffusion"
+    """Which grasp generator: `diffusion` (the learned one that ships), `antipodal`, `obb_sweep` (no learning),
     `graspgen`, `graspgenx` (NVIDIA's; weights are yours to bring), or `union:a+b` of any of them."""
     generator_weights: str = ""
     """Checkpoint of `graspgen` (.yml) or `graspgenx` (folder), or other weights (.npz) of `diffusion`; empty = ours."""

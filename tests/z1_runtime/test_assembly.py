@@ -29,11 +29,11 @@ def test_an_unknown_generator_is_refused_with_the_known_ones(tmp_path):
         load_config(path)
 
 
-def test_a_file_may_choose_the_learned_generator(tmp_path):
+def test_a_file_may_choose_a_generator_without_learning(tmp_path):
     path = tmp_path / "config.yaml"
-    path.write_text("generator: diffusion\n")
-    assert load_config(path).generator == "diffusion"
-    assert RuntimeConfig().generator == "antipodal"
+    path.write_text("generator: antipodal\n")
+    assert load_config(path).generator == "antipodal"
+    assert RuntimeConfig().generator == "diffusion"
 
 
 def test_the_parts_get_the_configuration_s_numbers():
@@ -45,7 +45,7 @@ def test_the_parts_get_the_configuration_s_numbers():
     assert decider.planner.config.lift_m == 0.05
     assert decider.planner._limits.velocity == pytest.approx(MotionLimits.at_speed(0.25).velocity)
     assert np.array_equal(decider.T_flange_camera, moved)
-    assert isinstance(decider.generator, AntipodalSampler)
+    assert isinstance(decider.generator, DiffusionSampler)
 
 
 def test_planner_and_decider_share_one_model_of_the_arm():

@@ -21,7 +21,7 @@ from z1_runtime.perception import NoDepthError, NoDetectionError, PerceptionErro
 from z1_runtime.planner import NoPlanError
 
 Q = np.append(z1.Q_HOME, -1.0)
-CONFIG = RuntimeConfig(n_candidates=300)
+CONFIG = RuntimeConfig(detector="tabletop", generator="antipodal", n_candidates=300)
 
 
 @pytest.fixture(scope="module")
@@ -157,7 +157,7 @@ def test_candidates_that_all_come_from_behind_leave_no_plan(decider, decision, T
         with_part(decider, generator=FromBehind()).decide(draw_can(T_base_camera), Q)
 
 
-@pytest.mark.parametrize("detector", ["tabletop", "truth"])
+@pytest.mark.parametrize("detector", ["tabletop", "truth", "yolo"])
 def test_warming_up_decides_without_a_camera_whichever_the_detector(detector, caplog):
     with caplog.at_level("INFO", "z1_runtime.decision"):
         make_decider(replace(RuntimeConfig(), detector=detector)).warm_up()
@@ -165,7 +165,7 @@ def test_warming_up_decides_without_a_camera_whichever_the_detector(detector, ca
 
 
 def test_a_configuration_that_cannot_grasp_the_warm_up_scene_is_told_at_the_real_one(T_base_camera, caplog):
-    config = RuntimeConfig()
+    config = RuntimeConfig(detector="tabletop", generator="antipodal")
     high = make_decider(replace(config, planner=replace(config.planner, lift_m=0.5)))
     with caplog.at_level("INFO", "z1_runtime.decision"):
         high.warm_up()

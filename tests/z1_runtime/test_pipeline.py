@@ -21,7 +21,7 @@ from z1_runtime.inspect import Inspector
 from z1_runtime.perception import NoDepthError, NoDetectionError
 from z1_runtime.pipeline import PickPipeline
 
-CONFIG = RuntimeConfig(n_candidates=300, hold_s=0.2, frame_timeout_s=0.5)
+CONFIG = RuntimeConfig(detector="tabletop", generator="antipodal", n_candidates=300, hold_s=0.2, frame_timeout_s=0.5)
 Q_LOOK = np.append(z1.Q_HOME, CONFIG.jaw_home)
 PHASES = ["home", "look", "decide", "transfer", "approach", "close", "lift", "hold"]
 
