@@ -134,9 +134,12 @@ def place_objects(
     centre: np.ndarray,
     by_wrist: bool,
     crowd: bool,
+    end_on: bool,
     rng: np.random.Generator,
 ) -> list[np.ndarray]:
     """Put the first object at `centre`, the others near it, or in a crowd wherever the camera looks.
+
+    Unless `end_on`, no bottle or cylinder points at the lens, where only colours tell it from any disc.
 
     Returns the poses (4, 4) of those that fit, which stay.
     """
@@ -150,6 +153,8 @@ def place_objects(
             xy = around[:2] + rng.normal(0.0, 0.01 if crowd else spread, 2)
             above = rng.uniform(0.01, 0.15) if rng.random() < 0.08 else 0.0  # lifted, or falling
             pose = _standing_at(actor, xy, _random_lean(rng), above)
+            if not end_on and _is_end_on(actor, pose, T_base_camera[:3, 3]):
+                continue
             if _fits(stage, actor, pose, others=poses, T_base_camera=T_base_camera, by_wrist=by_wrist):
                 stage.put(actor, pose)
                 poses.append(pose)
@@ -175,7 +180,7 @@ def _fits(
         return False
     corners = np.vstack(actor.prop.corners())
     depths = (corners @ pose[:3, :3].T + pose[:3, 3] - T_base_camera[:3, 3]) @ T_base_camera[:3, 2]
-    if depths.min() < NEAREST_M or _is_end_on(actor, pose, T_base_camera[:3, 3]):
+    if depths.min() < NEAREST_M:
         return False
     if not by_wrist:
         return True

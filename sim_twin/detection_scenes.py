@@ -91,7 +91,9 @@ def draw_scene(stage: Stage, rng: np.random.Generator, mix: SceneMix | None = No
         if rng.random() < mix.empty
         else choose_objects(stage, rng, nominal=1.0 if as_twin else mix.nominal, crowd=crowd)
     )
-    places = place_objects(stage, objects, T_base_camera, centre=centre, by_wrist=by_wrist, crowd=crowd, rng=rng)
+    places = place_objects(
+        stage, objects, T_base_camera, centre=centre, by_wrist=by_wrist, crowd=crowd, end_on=as_twin, rng=rng
+    )
     place_distractors(stage, places, T_base_camera, centre, rng)
     if places and rng.random() < mix.occluded:
         place_occluder(stage, places[0], T_base_camera, rng)
