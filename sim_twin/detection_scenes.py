@@ -185,4 +185,4 @@ def _shows_too_little(stage: Stage, actor: Actor, mask: np.ndarray, T_base_camer
         mark = outline(corners[-2:], T_base_camera, stage.intrinsics)  # neck and cap
         if mark is None or seen_share(mask, mark) < LEAST_MARK_SHARE:
             return True
-    return seen < LEAST_SHARE * 4 * np.count_nonzero(whole) and seen < _LARGE_SHARE * mask.size
+    return seen < LEAST_SHARE * 4 * int(np.count_nonzero(whole)) and seen < _LARGE_SHARE * mask.size
