@@ -33,6 +33,9 @@ class ServoLimits:
     """(7,) highest motor torque [Nm]."""
     grip_torque_nm: float = 3.0
     """The gripper's command leads its measurement by no more than this torque divided by its stiffness [Nm]."""
+    gripper_lag_s: float = 0.03
+    """A jaw that moves is led by as much more as it goes in this time, since it is heard of that late [s]. Without it a
+    late arm's jaw would crawl, and close after the hand has turned. Where it is held up, it does not move."""
     start_error_rad: float = 0.05
     """How far the first point of a trajectory may be from the arm [rad]."""
     following_error_rad: float = 0.3
@@ -69,13 +72,20 @@ class ClippedSetpoint(NamedTuple):
 
 
 def clip_setpoint(
-    limits: ServoLimits, q: np.ndarray, dq: np.ndarray, q_last: np.ndarray, q_measured: np.ndarray
+    limits: ServoLimits,
+    q: np.ndarray,
+    dq: np.ndarray,
+    *,
+    q_last: np.ndarray,
+    q_measured: np.ndarray,
+    dq_measured: np.ndarray,
 ) -> ClippedSetpoint:
     """Return the setpoint nearest to `q` that the arm may have this tick.
 
     In this order: joint positions; the gripper's lead over its measurement, so that |K_P (q − q_measured)| stays
-    within the grip torque (a grasp squeezes with a bounded force, whatever it was told); the step from `q_last`,
-    so that no joint is ever asked for more than `dq_max`. The step comes last because it protects the motors.
+    within the grip torque once the jaw rests (a grasp squeezes with a bounded force, whatever it was told); the step
+    from `q_last`, so that no joint is ever asked for more than `dq_max`. The step comes last because it protects the
+    motors.
 
     Args:
         limits: the limits.
@@ -83,13 +93,16 @@ def clip_setpoint(
         dq: (7,) wished velocities [rad/s].
         q_last: (7,) setpoint of the tick before [rad].
         q_measured: (7,) newest measurement [rad].
+        dq_measured: (7,) the same of the velocities [rad/s].
     """
     allowed = np.minimum(np.maximum(q, limits.q_min), limits.q_max)
     velocity = np.minimum(np.maximum(dq, -limits.dq_max), limits.dq_max)
     # Position servos add their damping times this speed: at a limit it would push beyond it.
     velocity[allowed != q] = 0.0
     lead_rad = limits.grip_torque_nm / z1.KP[_GRIPPER]
-    grip = min(max(allowed[_GRIPPER], q_measured[_GRIPPER] - lead_rad), q_measured[_GRIPPER] + lead_rad)
+    on_rad = min(max(dq_measured[_GRIPPER], -limits.dq_max[_GRIPPER]), limits.dq_max[_GRIPPER]) * limits.gripper_lag_s
+    low, high = q_measured[_GRIPPER] - lead_rad + min(on_rad, 0.0), q_measured[_GRIPPER] + lead_rad + max(on_rad, 0.0)
+    grip = min(max(allowed[_GRIPPER], low), high)
     if grip != allowed[_GRIPPER]:
         allowed[_GRIPPER] = grip
         velocity[_GRIPPER] = 0.0

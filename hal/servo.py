@@ -192,7 +192,14 @@ class Servo:
         if not isinstance(setpoint, ArmSetpoint):
             raise CommandRefusedError(f"send() takes an ArmSetpoint, not a {type(setpoint).__name__}.")
         self._orders.send(setpoint, owner, self.clock.now_s(), snapshot)
-        allowed = clip_setpoint(self.limits, setpoint.q, setpoint.dq, snapshot.q_sent, snapshot.state.q)
+        allowed = clip_setpoint(
+            self.limits,
+            setpoint.q,
+            setpoint.dq,
+            q_last=snapshot.q_sent,
+            q_measured=snapshot.state.q,
+            dq_measured=snapshot.state.dq,
+        )
         return ArmSetpoint(q=allowed.q, dq=allowed.dq)
 
     def status(self) -> ServoStatus:
@@ -315,7 +322,8 @@ class Servo:
         return f"no heartbeat from {lease.owner!r} for {silent_s:.3f} s (allowed {allowed_s} s)"
 
     def _command(self, q: np.ndarray, dq: np.ndarray) -> None:
-        allowed = clip_setpoint(self.limits, q, dq, self._q_sent, self._state.q)
+        state = self._state
+        allowed = clip_setpoint(self.limits, q, dq, q_last=self._q_sent, q_measured=state.q, dq_measured=state.dq)
         self._clips += allowed.clipped
         noted = np.minimum(np.maximum(q, self.limits.q_min), self.limits.q_max)
         noted[:N_ARM] = allowed.q[:N_ARM]

@@ -33,6 +33,9 @@ class CollisionConfig:
     """The same for scene and object while the arm goes to the pre-grasp [m]."""
     table_margin_m: float = 0.004
     """Least height of the gripper over the table [m]."""
+    closing_margin_m: float = 0.002
+    """The same while the jaws close and the hand turns with them: what the plane may be off, as the HAL's guard refuses
+    what goes below its own [m]."""
     link_margin_m: float = 0.010
     """Least height of the arm's links over the table [m]."""
     table_noise_m: float = 0.007
@@ -51,7 +54,7 @@ class CollisionConfig:
         for name in (*thresholds, "object_halo_m", "robot_halo_m"):
             if not 0.0 <= getattr(self, name) <= MAX_THRESHOLD_M:
                 raise ValueError(f"{name} is {getattr(self, name)}; allowed is 0 to {MAX_THRESHOLD_M} m.")
-        for name in ("table_margin_m", "link_margin_m", "table_noise_m", "cut_off_m"):
+        for name in ("table_margin_m", "closing_margin_m", "link_margin_m", "table_noise_m", "cut_off_m"):
             if not 0.0 <= getattr(self, name) < np.inf:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be finite and not negative.")
         if not z1.CONTROL_PERIOD_S <= self.sample_s <= 0.05:
@@ -163,8 +166,7 @@ class CollisionChecker:
 
     def spare_height_m(self, T_base_pivots: np.ndarray, jaws: np.ndarray) -> np.ndarray:
         """Return how far (N,) the gripper could still go down at pivot poses (N, 4, 4) and mover angles (N,) [m]."""
-        parts = ((T_base_pivots, self._shape.fixed), (T_base_pivots @ mover_pose(jaws), self._shape.mover))
-        return np.min([self._lowest(T, vertices) for T, vertices in parts], axis=0) - self.config.table_margin_m
+        return self._heights(T_base_pivots, jaws) - self.config.table_margin_m
 
     def check_posture(self, q: np.ndarray) -> Problem | None:
         """Return what the arm at `q` (7,) hits: table or itself."""
@@ -194,6 +196,19 @@ class CollisionChecker:
             return hits.problem(int(blocked.argmax()))
         return self._first_link_hit(poses.links)
 
+    def check_closing(self, trajectory: JointTrajectory) -> Problem | None:
+        """Return how the gripper comes too near to the table along `trajectory`, or None; all else it may touch."""
+        step = max(1, round(self.config.sample_s / z1.CONTROL_PERIOD_S))
+        q = np.concatenate([trajectory.q[:-1:step], trajectory.q[-1:]])
+        lowest = float(self._heights(ArmPoses.at(self._kinematics, q).pivots, q[:, -1]).min())
+        if lowest >= self.config.closing_margin_m:
+            return None
+        return Problem(
+            reason="table",
+            detail=f"the gripper's lowest point would be {lowest * 1e3:.0f} mm above the table; allowed is "
+            f"{self.config.closing_margin_m * 1e3:.0f} mm.",
+        )
+
     def _first_link_hit(self, links: np.ndarray) -> Problem | None:
         for c, capsule in enumerate(CAPSULES):
             if not MAY_MEET_SCENE[c]:
@@ -203,6 +218,10 @@ class CollisionChecker:
                 point = self.scene_index.points[hit[hit >= 0][0]]
                 return Problem(reason="scene", detail=f"{capsule.link} hits the scene at {_metres(point)}.")
         return None
+
+    def _heights(self, T_base_pivots: np.ndarray, jaws: np.ndarray) -> np.ndarray:
+        parts = ((T_base_pivots, self._shape.fixed), (T_base_pivots @ mover_pose(jaws), self._shape.mover))
+        return np.min([self._lowest(T, vertices) for T, vertices in parts], axis=0)
 
     def _lowest(self, T: np.ndarray, vertices: np.ndarray) -> np.ndarray:
         up = self.table.normal

@@ -122,11 +122,23 @@ class Decider:
         """
         times = times or StageTimes()
         jaw = float(q[-1])
-        T_base_camera = self.kinematics.flange(q[: z1.N_ARM]) @ self.T_flange_camera
         with times.stage("detect"):
+            T_base_camera = self.kinematics.flange(q[: z1.N_ARM]) @ self._mount_in(frame, jaw)
             detection = self.perception.detect(frame, T_base_camera, jaw, self.config.object_class or None)
         with times.stage("cloud"):
             return self.perception.segment(frame, T_base_camera, jaw, detection)
+
+    def _mount_in(self, frame: RgbdFrame, jaw: float) -> np.ndarray:
+        """Return T_flange_camera (4, 4) as it is known, or as the jaws in `frame` show it where that is another."""
+        seen = self.config.perception.mount.correct(frame, jaw, self.T_flange_camera)
+        if seen is None:
+            return self.T_flange_camera
+        _LOG.info(
+            "the jaws in the picture show the camera off its mount: what is 0.4 m ahead is %.1f mm beside its place. "
+            "This look makes up for it; calibrate the camera with `./z1 calibrate hand-eye`.",
+            1e3 * seen.moved_m,
+        )
+        return seen.T_flange_camera
 
     def propose(self, observation: Observation) -> GraspSet:
         """Return the generator's candidates for the object, in the camera frame.

@@ -149,6 +149,7 @@ class MotionPlanner:
             ),
             "on the approach, ",
         )
+        _refuse(checker.check_closing(close), "while closing, ")
         _refuse(checker.check_trajectory(lift, threshold_m=checker.config.scene_threshold_m), "while lifting, ")
         transfer = self._transfer(q_pre, T_pre)
         return Motion(transfer=transfer, approach=approach, close=close, lift=lift)

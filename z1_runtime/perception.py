@@ -26,6 +26,7 @@ from z1_runtime.cloud import (
 )
 from z1_runtime.detectors import Detector
 from z1_runtime.hidden import hidden_points
+from z1_runtime.mount_sight import MountSight
 from z1_runtime.own_gripper import OwnGripper
 from z1_runtime.table import TableConfig, expected_table, fit_table
 from z1_runtime.types import Observation
@@ -75,6 +76,8 @@ class PerceptionConfig:
     """Fewest points of the object's cloud."""
     table: TableConfig = field(default_factory=TableConfig)
     own: OwnGripper = field(default_factory=OwnGripper)
+    mount: MountSight = field(default_factory=MountSight)
+    """Whether the jaws in the picture may correct where the camera sits."""
 
     def __post_init__(self) -> None:
         if self.crop not in ("mask", "box"):

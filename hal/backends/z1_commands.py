@@ -62,12 +62,12 @@ class Z1Commands:
         In this order: `hal.limits.clip_setpoint` (joint limits, grip torque, one period's step at the highest speed),
         the lead over the measurement, and in low-level mode the torques.
         """
-        measured = self._client.newest.joints.q
-        q, dq = setpoint.q, setpoint.dq
+        joints = self._client.newest.joints
+        measured, q, dq = joints.q, setpoint.q, setpoint.dq
         if self.grip_nm is not None:
             q, dq = q.copy(), dq.copy()
             q[_GRIPPER], dq[_GRIPPER] = measured[_GRIPPER] + self.grip_nm / z1.KP[_GRIPPER], 0.0
-        allowed = clip_setpoint(self._limits, q, dq, self.q_sent, measured)
+        allowed = clip_setpoint(self._limits, q, dq, q_last=self.q_sent, q_measured=measured, dq_measured=joints.dq)
         q = np.minimum(np.maximum(allowed.q, measured - _MAX_LEAD_RAD), measured + _MAX_LEAD_RAD)
         q, dq = self._write(q, np.where(q == allowed.q, allowed.dq, 0.0))
         self.q_sent = q

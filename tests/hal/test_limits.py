@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hal.errors import InvalidMessageError
-from hal.limits import OverloadWatch, ServoLimits, clip_setpoint, find_blocked, servo_torque
+from hal.limits import ClippedSetpoint, OverloadWatch, ServoLimits, clip_setpoint, find_blocked, servo_torque
 from hal.z1 import CONTROL_PERIOD_S, DQ_MAX, KP, N_ARM, N_JOINTS, Q_MAX, Q_MIN
 
 LIMITS = ServoLimits()
@@ -14,16 +14,22 @@ MIDDLE = (Q_MIN + Q_MAX) / 2
 ZERO = np.zeros(N_JOINTS)
 
 
+def clip(
+    q: np.ndarray, dq: np.ndarray, q_last: np.ndarray, q_measured: np.ndarray, dq_measured: np.ndarray = ZERO
+) -> ClippedSetpoint:
+    return clip_setpoint(LIMITS, q, dq, q_last=q_last, q_measured=q_measured, dq_measured=dq_measured)
+
+
 def test_a_harmless_setpoint_is_let_through_as_it_is() -> None:
     q = MIDDLE + 0.001
-    allowed = clip_setpoint(LIMITS, q, ZERO + 0.5, MIDDLE, MIDDLE)
+    allowed = clip(q, ZERO + 0.5, MIDDLE, MIDDLE)
     assert (allowed.q == q).all()
     assert (allowed.dq == 0.5).all()
     assert not allowed.clipped
 
 
 def test_a_step_is_no_faster_than_the_joints() -> None:
-    allowed = clip_setpoint(LIMITS, MIDDLE + 0.5, ZERO + 9.0, MIDDLE, MIDDLE)
+    allowed = clip(MIDDLE + 0.5, ZERO + 9.0, MIDDLE, MIDDLE)
     assert allowed.q == pytest.approx(MIDDLE + DQ_MAX * CONTROL_PERIOD_S)
     assert allowed.dq[:N_ARM] == pytest.approx(DQ_MAX[:N_ARM])
     assert allowed.clipped
@@ -31,14 +37,14 @@ def test_a_step_is_no_faster_than_the_joints() -> None:
 
 @pytest.mark.parametrize(("edge", "side"), [(Q_MIN, -1.0), (Q_MAX, 1.0)])
 def test_positions_end_at_the_joint_limits(edge: np.ndarray, side: float) -> None:
-    allowed = clip_setpoint(LIMITS, edge + side, ZERO, edge - side * 0.001, edge)
+    allowed = clip(edge + side, ZERO, edge - side * 0.001, edge)
     assert allowed.q == pytest.approx(edge)
 
 
 def test_what_is_clipped_at_a_joint_limit_is_not_told_to_move_on() -> None:
     wish = MIDDLE.copy()
     wish[4] = Q_MAX[4] + 0.001
-    allowed = clip_setpoint(LIMITS, wish, ZERO + 1.0, wish, wish)
+    allowed = clip(wish, ZERO + 1.0, wish, wish)
     assert allowed.dq.tolist() == [1, 1, 1, 1, 0, 1, 1]
 
 
@@ -48,15 +54,39 @@ def test_the_gripper_leads_its_measurement_by_the_grip_torque_at_most(side: floa
     wish[N_ARM] += side * 0.5
     last = MIDDLE.copy()
     last[N_ARM] += side * 0.022
-    allowed = clip_setpoint(LIMITS, wish, ZERO + 1.0, last, MIDDLE)
+    allowed = clip(wish, ZERO + 1.0, last, MIDDLE)
     assert KP[N_ARM] * (allowed.q - MIDDLE)[N_ARM] == pytest.approx(side * 3.0)
     assert allowed.dq[N_ARM] == 0.0
     assert not allowed.clipped
 
 
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_a_jaw_that_moves_is_led_by_what_it_goes_until_it_is_heard_of(side: float) -> None:
+    wish, moving = MIDDLE.copy(), ZERO.copy()
+    wish[N_ARM] += side * 0.06
+    moving[N_ARM] = side * 2.0
+    ahead = clip(wish, moving, wish, MIDDLE, moving)
+    assert ahead.q[N_ARM] == wish[N_ARM]
+    assert ahead.dq[N_ARM] == side * 2.0
+    behind = clip(wish, moving, wish, MIDDLE, -moving)  # going the other way it is led by the torque alone
+    at_most = DQ_MAX[N_ARM] * CONTROL_PERIOD_S
+    assert side * (behind.q - MIDDLE)[N_ARM] == pytest.approx(max(3.0 / KP[N_ARM], 0.06 - at_most))
+
+
+def test_a_jaw_said_to_move_faster_than_it_can_is_led_no_further_for_it() -> None:
+    wish, moving = MIDDLE.copy(), ZERO.copy()
+    wish[N_ARM] += 0.5
+    moving[N_ARM] = 99.0
+    last = MIDDLE.copy()
+    last[N_ARM] += 0.5
+    lead = (clip(wish, ZERO, last, MIDDLE, moving).q - MIDDLE)[N_ARM]
+    most = 3.0 / KP[N_ARM] + DQ_MAX[N_ARM] * LIMITS.gripper_lag_s
+    assert lead == pytest.approx(max(most, 0.5 - DQ_MAX[N_ARM] * CONTROL_PERIOD_S))
+
+
 def test_an_arm_outside_its_limits_is_led_back_at_no_more_than_the_joints_speed() -> None:
     outside = Q_MAX + 0.1
-    allowed = clip_setpoint(LIMITS, outside, ZERO, outside, outside)
+    allowed = clip(outside, ZERO, outside, outside)
     assert allowed.q[:N_ARM] == pytest.approx((outside - DQ_MAX * CONTROL_PERIOD_S)[:N_ARM])
 
 

@@ -14,8 +14,9 @@ from hal.z1_shape import CAPSULES
 from z1_runtime.collision import CollisionChecker, CollisionConfig
 from z1_runtime.gripper import BeakGripper
 from z1_runtime.kinematics import Kinematics
+from z1_runtime.motion_limits import MotionLimits
 from z1_runtime.robot_model import gripper_shape
-from z1_runtime.trajectory import joint_move
+from z1_runtime.trajectory import gripper_move, joint_move
 from z1_runtime.voxels import SceneIndex
 
 FOLDED_INTO_BASE = np.array([0.0, 0.6, 0.0, 1.2, 0.0, 1.57, 0.0])
@@ -145,6 +146,21 @@ def test_an_arm_reaching_into_the_table_is_found(checker):
 def pivots_at(x: float, y: float, z: float) -> tuple[np.ndarray, float]:
     _, grasp = BeakGripper().fit(frontal(x, y, z, 0.0), 0.06)  # the flip with the camera above the hand
     return grasp.T_base_pivot[None], grasp.jaw_open
+
+
+def test_jaws_that_come_too_near_to_the_table_while_they_close_are_found(checker, kinematics):
+    verdicts = []
+    for z in np.arange(0.11, 0.0, -0.01):
+        _, grasp = BeakGripper().fit(frontal(0.48, 0.0, z, np.deg2rad(30)), 0.06)
+        (q, *_) = kinematics.solve(grasp.T_base_pivot)
+        close = gripper_move(np.append(q, grasp.jaw_open), 0.0, MotionLimits.at_speed(0.5))
+        pivots = np.repeat(grasp.T_base_pivot[None], len(close.q), axis=0)
+        lowest = checker.check_grippers(pivots, close.q[:, -1]).height_m.min()
+        verdicts.append(checker.check_closing(close))
+        assert (verdicts[-1] is None) == (lowest >= checker.config.closing_margin_m)
+    refused = [problem for problem in verdicts if problem is not None]
+    assert 0 < len(refused) < len(verdicts)
+    assert all(problem.reason == "table" for problem in refused)
 
 
 def test_the_jaws_around_the_object_are_free(checker):

@@ -102,6 +102,7 @@ def test_the_plan_keeps_its_distances_all_the_way(planner, kinematics):
     checker = CollisionChecker(kinematics, observation, Q_START)
     assert checker.check_trajectory(plan.transfer, threshold_m=0.004, object_threshold_m=0.004) is None
     assert checker.check_trajectory(plan.approach, threshold_m=0.002, object_threshold_m=0.001) is None
+    assert checker.check_closing(plan.close) is None
     assert checker.check_trajectory(plan.lift, threshold_m=0.002) is None
     for leg in (plan.transfer, plan.approach, plan.lift):
         poses = np.array([kinematics.pivot(q[: z1.N_ARM]) for q in leg.q[::10]])

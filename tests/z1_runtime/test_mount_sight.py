@@ -1,0 +1,95 @@
+"""The jaws in the picture tell where the camera sits; what is not the jaws tells nothing."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hal import z1
+from hal.messages import RgbdFrame
+from sim_twin.bench.trial import look
+from sim_twin.scene import SceneConfig
+from sim_twin.world import World
+from z1_runtime.cloud import transform
+from z1_runtime.mount_sight import MountSight
+from z1_runtime.se3 import inverse
+
+AHEAD = np.array([[0.0, 0.0, 0.4]])
+SIGHT = MountSight()
+
+
+def taken(scene: SceneConfig) -> tuple[RgbdFrame, float, np.ndarray]:
+    """Return the twin's frame from home, the jaw's angle, and where its camera truly sits on the flange."""
+    frame, q = look(scene)
+    data = World(scene).snapshot()
+    T_base_flange, T_base_camera = np.eye(4), np.eye(4)
+    T_base_flange[:3, :3], T_base_flange[:3, 3] = data.body("link06").xmat.reshape(3, 3), data.body("link06").xpos
+    T_base_camera[:3, :3] = data.cam("wrist").xmat.reshape(3, 3) * [1, -1, -1]
+    T_base_camera[:3, 3] = data.cam("wrist").xpos
+    return frame, float(q[-1]), inverse(T_base_flange) @ T_base_camera
+
+
+def beside_m(T_flange_camera: np.ndarray, T_true: np.ndarray) -> float:
+    """Return how far beside its place a mount shows what is 0.4 m ahead [m]."""
+    return float(np.linalg.norm(transform(inverse(T_true) @ T_flange_camera, AHEAD) - AHEAD))
+
+
+@pytest.fixture(scope="module")
+def straight() -> tuple[RgbdFrame, float, np.ndarray]:
+    return taken(SceneConfig(object="bottle"))
+
+
+@pytest.mark.parametrize("seed", [1, 3])
+def test_a_camera_off_its_mount_is_found_by_the_jaws_it_sees(seed: int) -> None:
+    scene = SceneConfig(object="bottle", mount_error_m=0.003, mount_error_deg=1.0, mount_seed=seed)
+    frame, jaw, T_true = taken(scene)
+    before = beside_m(z1.T_FLANGE_CAMERA, T_true)
+    seen = SIGHT.correct(frame, jaw, z1.T_FLANGE_CAMERA)
+    assert seen is not None
+    assert seen.moved_m == pytest.approx(before, abs=0.002)
+    assert beside_m(seen.T_flange_camera, T_true) < min(0.0025, 0.6 * before)
+
+
+def test_a_camera_that_sits_where_it_should_is_left_there(straight: tuple[RgbdFrame, float, np.ndarray]) -> None:
+    frame, jaw, T_true = straight
+    assert T_true == pytest.approx(z1.T_FLANGE_CAMERA, abs=1e-6)
+    seen = SIGHT.see(frame, jaw, z1.T_FLANGE_CAMERA)
+    assert seen is not None
+    assert seen.moved_m < SIGHT.least_m
+    assert seen.share > 0.85
+    assert SIGHT.correct(frame, jaw, z1.T_FLANGE_CAMERA) is None
+
+
+def test_without_the_jaws_in_view_nothing_is_seen(straight: tuple[RgbdFrame, float, np.ndarray]) -> None:
+    frame, jaw, _ = straight
+    blind = replace(frame, depth_m=np.zeros_like(frame.depth_m))
+    assert SIGHT.see(blind, jaw, z1.T_FLANGE_CAMERA) is None
+    assert SIGHT.correct(blind, jaw, z1.T_FLANGE_CAMERA) is None
+
+
+def test_a_card_before_the_jaws_is_not_taken_for_them(straight: tuple[RgbdFrame, float, np.ndarray]) -> None:
+    frame, jaw, _ = straight
+    card = replace(frame, depth_m=np.full_like(frame.depth_m, 0.09))
+    assert SIGHT.correct(card, jaw, z1.T_FLANGE_CAMERA) is None
+
+
+def test_it_can_be_switched_off() -> None:
+    scene = SceneConfig(object="bottle", mount_error_m=0.003, mount_error_deg=1.0, mount_seed=1)
+    frame, jaw, _ = taken(scene)
+    assert MountSight(enabled=False).correct(frame, jaw, z1.T_FLANGE_CAMERA) is None
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"least_m": 0.03}, "least_m and most_m are 0.03 and 0.02"),
+        ({"least_share": 0.0}, "least_share is 0.0"),
+        ({"most_rms_m": 1.0}, "most_rms_m is 1.0"),
+        ({"points": 10}, "points is 10; allowed is 300 or more"),
+    ],
+)
+def test_numbers_that_make_no_sense_are_refused(wrong: dict, said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        MountSight(**wrong)
