@@ -85,6 +85,7 @@ class Decider:
         self.config = config
         self.ranking = ranking_of(config)
         self.T_flange_camera = T_flange_camera
+        self._mount_doubted = False
 
     def decide(self, frame: RgbdFrame, q: np.ndarray) -> Decision:
         """Turn one frame, taken at joint positions `q` (7,), into a plan.
@@ -133,11 +134,13 @@ class Decider:
         seen = self.config.perception.mount.correct(frame, jaw, self.T_flange_camera)
         if seen is None:
             return self.T_flange_camera
-        _LOG.info(
-            "the jaws in the picture show the camera off its mount: what is 0.4 m ahead is %.1f mm beside its place. "
-            "This look makes up for it; calibrate the camera with `./z1 calibrate hand-eye`.",
-            1e3 * seen.moved_m,
-        )
+        if not self._mount_doubted:
+            self._mount_doubted = True
+            _LOG.warning(
+                "the jaws in the picture show the camera off its mount: what is 0.4 m ahead is %.1f mm beside its "
+                "place. Each look makes up for it; calibrate the camera with `./z1 calibrate hand-eye`.",
+                1e3 * seen.moved_m,
+            )
         return seen.T_flange_camera
 
     def propose(self, observation: Observation) -> GraspSet:

@@ -12,7 +12,9 @@ from hal.messages import RgbdFrame
 from sim_twin.bench.trial import look
 from sim_twin.scene import SceneConfig
 from sim_twin.world import World
+from z1_runtime.assembly import make_decider
 from z1_runtime.cloud import transform
+from z1_runtime.config import RuntimeConfig
 from z1_runtime.mount_sight import MountSight
 from z1_runtime.se3 import inverse
 
@@ -73,6 +75,20 @@ def test_a_card_before_the_jaws_is_not_taken_for_them(straight: tuple[RgbdFrame,
     frame, jaw, _ = straight
     card = replace(frame, depth_m=np.full_like(frame.depth_m, 0.09))
     assert SIGHT.correct(card, jaw, z1.T_FLANGE_CAMERA) is None
+
+
+def test_a_decider_sees_by_the_mount_that_the_jaws_show_and_says_so_once(caplog: pytest.LogCaptureFixture) -> None:
+    scene = SceneConfig(object="bottle", mount_error_m=0.003, mount_error_deg=1.0, mount_seed=3)
+    frame, jaw, T_true = taken(scene)
+    decider = make_decider(RuntimeConfig(detector="tabletop", generator="antipodal"))
+    q = np.append(z1.Q_HOME, jaw)
+    with caplog.at_level("WARNING", "z1_runtime.decision"):
+        seen = [decider.observe(frame, q) for _ in range(2)]
+    T_base_flange = decider.kinematics.flange(z1.Q_HOME)
+    assert beside_m(z1.T_FLANGE_CAMERA, T_true) > 0.004
+    for observation in seen:
+        assert beside_m(inverse(T_base_flange) @ observation.T_base_camera, T_true) < 0.0025
+    assert caplog.text.count("calibrate the camera") == 1
 
 
 def test_it_can_be_switched_off() -> None:
