@@ -1,8 +1,9 @@
 """How the camera sits on the hand, seen by itself: the jaws are always in its picture, and their shape is known.
 
 A mount that is off by 3 mm and 1° shows an object 0.4 m away up to 10 mm beside its place: too far for a grasp. The
-depth of the jaws, laid onto their meshes by iterative closest points (point to plane), tells that place to 0.7 mm in
-the mean, 1.9 mm at worst (42 looks in the twin, its noise included); so a camera that was knocked is made up for.
+depth of the jaws, laid onto their meshes by iterative closest points (point to plane), tells that place to 0.8 mm in
+the mean, 2.3 mm at worst (scripts/measure_mount_sight.py: 21 looks in the twin); so a camera that was knocked is made
+up for.
 """
 
 from __future__ import annotations

@@ -11,7 +11,6 @@ from hal import z1
 from hal.messages import RgbdFrame
 from sim_twin.bench.trial import look
 from sim_twin.scene import SceneConfig
-from sim_twin.world import World
 from z1_runtime.assembly import make_decider
 from z1_runtime.cloud import transform
 from z1_runtime.config import RuntimeConfig
@@ -25,12 +24,7 @@ SIGHT = MountSight()
 def taken(scene: SceneConfig) -> tuple[RgbdFrame, float, np.ndarray]:
     """Return the twin's frame from home, the jaw's angle, and where its camera truly sits on the flange."""
     frame, q = look(scene)
-    data = World(scene).snapshot()
-    T_base_flange, T_base_camera = np.eye(4), np.eye(4)
-    T_base_flange[:3, :3], T_base_flange[:3, 3] = data.body("link06").xmat.reshape(3, 3), data.body("link06").xpos
-    T_base_camera[:3, :3] = data.cam("wrist").xmat.reshape(3, 3) * [1, -1, -1]
-    T_base_camera[:3, 3] = data.cam("wrist").xpos
-    return frame, float(q[-1]), inverse(T_base_flange) @ T_base_camera
+    return frame, float(q[-1]), scene.T_flange_camera()
 
 
 def beside_m(T_flange_camera: np.ndarray, T_true: np.ndarray) -> float:
