@@ -20,6 +20,7 @@ from hal.messages import RgbdFrame
 from z1_runtime.cloud import transform
 from z1_runtime.gripper import mover_pose
 from z1_runtime.own_gripper import OwnGripper
+from z1_runtime.robot_model import T_PIVOT_STATOR
 from z1_runtime.se3 import inverse
 
 _SAMPLES = {"z1_GripperStator": 50_000, "z1_GripperMover": 30_000}
@@ -141,9 +142,7 @@ def _step(at: np.ndarray, normals: np.ndarray, offsets: np.ndarray) -> np.ndarra
 def _jaws(jaw: float) -> tuple[np.ndarray, np.ndarray]:
     """Return surface points (N, 3) [m] and outward normals (N, 3) of both jaws in the flange frame."""
     (fixed, fixed_normals), (mover, mover_normals) = (_sampled(name) for name in _SAMPLES)
-    T_pivot_stator = np.eye(4)
-    T_pivot_stator[0, 3] = -0.049  # URDF: the mover's joint on the stator
-    T_stator, T_mover = z1.T_FLANGE_PIVOT @ T_pivot_stator, z1.T_FLANGE_PIVOT @ mover_pose(jaw)
+    T_stator, T_mover = z1.T_FLANGE_PIVOT @ T_PIVOT_STATOR, z1.T_FLANGE_PIVOT @ mover_pose(jaw)
     points = [transform(T_stator, fixed), transform(T_mover, mover)]
     return np.concatenate(points), np.concatenate(
         [fixed_normals @ T_stator[:3, :3].T, mover_normals @ T_mover[:3, :3].T]

@@ -11,6 +11,11 @@ from hal import z1
 from z1_runtime.gripper import PALM_RADIUS_M
 from z1_runtime.voxels import spread_first
 
+T_PIVOT_STATOR = np.eye(4)
+"""(4, 4) the fixed jaw's mesh in the pivot frame: the mover's joint on the stator, of the URDF."""
+T_PIVOT_STATOR[0, 3] = -0.049
+T_PIVOT_STATOR.setflags(write=False)
+
 _SPACING_M = 0.0085
 _JAW_SPACING_M = 0.005  # jaws pass the object within millimetres, and its edges must not slip between two points
 
@@ -32,10 +37,8 @@ class GripperShape:
 def gripper_shape(spacing_m: float = _SPACING_M) -> GripperShape:
     """Return the points, sampled from the STL meshes about `spacing_m` apart [m], closer on the jaws."""
     T_pivot_flange = np.linalg.inv(z1.T_FLANGE_PIVOT)
-    T_pivot_stator = np.eye(4)
-    T_pivot_stator[0, 3] = -0.049  # URDF: the mover's joint on the stator
-    stator = _moved(T_pivot_stator, _mesh_surface("z1_GripperStator", spacing_m))
-    jaw = _moved(T_pivot_stator, _mesh_surface("z1_GripperStator", _JAW_SPACING_M))
+    stator = _moved(T_PIVOT_STATOR, _mesh_surface("z1_GripperStator", spacing_m))
+    jaw = _moved(T_PIVOT_STATOR, _mesh_surface("z1_GripperStator", _JAW_SPACING_M))
     stator = np.concatenate([stator[stator[:, 0] < PALM_RADIUS_M], jaw[jaw[:, 0] >= PALM_RADIUS_M]])
     # The housing is hollow; nothing gets inside without crossing what surrounds it
     inside = (np.hypot(stator[:, 0], stator[:, 2]) < PALM_RADIUS_M - 0.002) & (np.abs(stator[:, 1]) < 0.026)
