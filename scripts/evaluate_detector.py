@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import cv2
@@ -86,11 +86,8 @@ def main(config: Config) -> None:
 
 
 def measure_held_out(detector: YoloDetector, data: Path, most: int) -> dict[str, object]:
-    """Return mean average precision of boxes and masks over the held-out pictures, as ultralytics reckons it."""
-    from ultralytics.utils.metrics import ap_per_class
-
-    rows: list[tuple[np.ndarray, np.ndarray, float, int]] = []
-    targets: list[int] = []
+    """Return mean average precision of boxes and masks over the held-out pictures, of all and by their look."""
+    looks: dict[str, Tally] = {}
     good = [0, 0, 0]  # at the default threshold: found and right, found, there
     images = _images(data, "val")[:most]
     for image in track(images, description="held-out pictures"):
@@ -98,20 +95,43 @@ def measure_held_out(detector: YoloDetector, data: Path, most: int) -> dict[str,
         labels = read_labels(label_file(image), colour.shape[:2])
         found = detector.detect(colour, _LOWEST_CONFIDENCE)
         by_box, by_mask = match(found, labels)
+        tally = looks.setdefault(image.stem.partition("_")[2], Tally())
         numbers = [CLASSES.index(detection.label) for detection in found]
-        rows += list(zip(by_box, by_mask, [d.confidence for d in found], numbers, strict=True))
-        targets += [CLASSES.index(label.name) for label in labels]
+        tally.rows += list(zip(by_box, by_mask, [d.confidence for d in found], numbers, strict=True))
+        tally.targets += [CLASSES.index(label.name) for label in labels]
         sure = np.array([d.confidence > detector.config.min_confidence for d in found], dtype=bool)
         good = [a + int(b) for a, b in zip(good, (by_box[sure, 0].sum(), sure.sum(), len(labels)), strict=True)]
-    scores, classes = np.array([row[2] for row in rows]), np.array([row[3] for row in rows])
-    figures: dict[str, object] = {"held_out_pictures": len(images), "held_out_objects": len(targets)}
+    together = Tally(
+        rows=[row for tally in looks.values() for row in tally.rows],
+        targets=[number for tally in looks.values() for number in tally.targets],
+    )
+    figures: dict[str, object] = {"held_out_pictures": len(images), "held_out_objects": len(together.targets)}
     for name, column in (("box", 0), ("mask", 1)):
-        hits = np.array([row[column] for row in rows])
-        precision = ap_per_class(hits, scores, classes, np.array(targets))[5]
+        precision = together.average_precision(column)
         figures[f"{name}_map50"], figures[f"{name}_map50_95"] = _round(precision[:, 0].mean()), _round(precision.mean())
         figures[f"{name}_ap50_95"] = dict(zip(CLASSES, (_round(p) for p in precision.mean(axis=1)), strict=True))
+        figures[f"{name}_map50_by_look"] = {
+            look: _round(tally.average_precision(column)[:, 0].mean()) for look, tally in sorted(looks.items())
+        }
     figures["precision"], figures["recall"] = _round(good[0] / max(good[1], 1)), _round(good[0] / max(good[2], 1))
     return figures
+
+
+@dataclass(slots=True, kw_only=True)
+class Tally:
+    """What was found on some pictures, and what is there."""
+
+    rows: list[tuple[np.ndarray, np.ndarray, float, int]] = field(default_factory=list)
+    """Of each detection: its hits by box and by mask, see `match`, its confidence and the number of its class."""
+    targets: list[int] = field(default_factory=list)
+    """The number of each object's class."""
+
+    def average_precision(self, column: int) -> np.ndarray:
+        """Return it (class, threshold), as ultralytics reckons it, by box (`column` 0) or by mask (1)."""
+        from ultralytics.utils.metrics import ap_per_class
+
+        hits, scores = np.array([row[column] for row in self.rows]), np.array([row[2] for row in self.rows])
+        return ap_per_class(hits, scores, np.array([row[3] for row in self.rows]), np.array(self.targets))[5]
 
 
 def match(found: list[Detection], labels: tuple[Label, ...]) -> tuple[np.ndarray, np.ndarray]:

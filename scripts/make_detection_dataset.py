@@ -35,7 +35,7 @@ _CHANGES = {"train": {"crowd": 0.75, "empty": 0.05}, "empty": {"empty": 1.0}}
 class Config:
     """How many pictures, and of what."""
 
-    train: int = 5000
+    train: int = 8000
     """Pictures to learn from."""
     val: int = 500
     """Held-out pictures."""
@@ -106,7 +106,8 @@ def make_shard(shard: Shard) -> None:
     stage = Stage(shard.seed)
     for number in range(shard.count):
         picture = draw_scene(stage, np.random.default_rng([shard.seed, 2, number]), shard.mix)
-        _write_picture(picture, images / f"{number:04d}.jpg", labels / f"{number:04d}.txt")
+        name = f"{number:04d}_{picture.look}"
+        _write_picture(picture, images / f"{name}.jpg", labels / f"{name}.txt")
     stage.close()
     if shard.folder.is_dir():  # another process was faster
         shutil.rmtree(images)

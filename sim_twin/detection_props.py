@@ -179,19 +179,6 @@ def _make_ring(rng: np.random.Generator) -> Prop:
     return _prop("ring", *[piece] * n, poses=poses)
 
 
-def _make_star(rng: np.random.Generator) -> Prop:
-    """A jack: three crossed bars."""
-    long, thick = rng.uniform(0.03, 0.06), rng.uniform(0.006, 0.012)
-    bars = [_part("box", tuple(long if k == axis else thick for k in range(3))) for axis in range(3)]
-    return _prop("star", *bars)
-
-
-def _make_snowman(rng: np.random.Generator) -> Prop:
-    radius = rng.uniform(0.025, 0.04)
-    head = replace(_part("ellipsoid", (0.6 * radius,) * 3), z_m=0.9 * radius)
-    return _prop("snowman", replace(_part("ellipsoid", (radius,) * 3), z_m=-0.6 * radius), head)
-
-
 _DISTRACTORS: dict[str, Callable[[np.random.Generator], Prop]] = {
     "ball": _make_ball,
     "egg": _make_egg,
@@ -201,6 +188,4 @@ _DISTRACTORS: dict[str, Callable[[np.random.Generator], Prop]] = {
     "angle": _make_angle,
     "mug": _make_mug,
     "ring": _make_ring,
-    "star": _make_star,
-    "snowman": _make_snowman,
 }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import cv2
 import numpy as np
@@ -24,6 +24,8 @@ from sim_twin.photo import spoil_photo
 if TYPE_CHECKING:
     from hal.messages import Intrinsics
 
+Look = Literal["twin", "own", "any"]
+"""How things look: all as in the twin; our objects in their own colours, the rest at random; all at random."""
 LEAST_PIXELS = 600
 """An object that shows fewer pixels at 640×480 is taken out of the scene."""
 LEAST_SHARE = 0.5
@@ -56,6 +58,7 @@ class Picture:
     """(H, W, 3) uint8, RGB."""
     labels: tuple[Label, ...]
     """Nothing else in the picture is a bottle, a cylinder or a box."""
+    look: Look = "any"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -66,10 +69,12 @@ class SceneMix:
     """No object at all, only distractors or nothing."""
     wrist: float = 0.85
     """Seen by the wrist camera past the jaws; the others from anywhere."""
-    twin_look: float = 0.4
+    twin: float = 0.35
     """In the twin's own colours and light."""
+    own: float = 0.4
+    """The objects in their own colours; room, light and what is no object at random, as the arm will meet them."""
     nominal: float = 0.75
-    """Share of the objects with the benchmark's own measures; in the twin's look all have them."""
+    """Share of the objects with the benchmark's own measures where colours are anyhow; in their own all have them."""
     occluded: float = 0.2
     """Something put in front of the first object on purpose."""
     crowd: float = 0.0
@@ -81,7 +86,7 @@ def draw_scene(stage: Stage, rng: np.random.Generator, mix: SceneMix | None = No
     mix = mix or SceneMix()
     stage.clear()
     by_wrist = rng.random() < mix.wrist
-    as_twin = rng.random() < mix.twin_look
+    look = _choose_look(rng, mix)
     arm = "pieces" if by_wrist else "whole" if rng.random() < 0.25 else "none"
     camera = "wrist" if by_wrist else "free"
     T_base_camera, centre = place_camera(stage, by_wrist, rng)
@@ -89,23 +94,29 @@ def draw_scene(stage: Stage, rng: np.random.Generator, mix: SceneMix | None = No
     objects = (
         []
         if rng.random() < mix.empty
-        else choose_objects(stage, rng, nominal=1.0 if as_twin else mix.nominal, crowd=crowd)
+        else choose_objects(stage, rng, nominal=mix.nominal if look == "any" else 1.0, crowd=crowd)
     )
+    end_on = look == "twin"
     places = place_objects(
-        stage, objects, T_base_camera, centre=centre, by_wrist=by_wrist, crowd=crowd, end_on=as_twin, rng=rng
+        stage, objects, T_base_camera, centre=centre, by_wrist=by_wrist, crowd=crowd, end_on=end_on, rng=rng
     )
     place_distractors(stage, places, T_base_camera, centre, rng)
     if places and rng.random() < mix.occluded:
         place_occluder(stage, places[0], T_base_camera, rng)
-    if as_twin:
+    if look == "twin":
         stage.dress_as_twin()
     else:
-        stage.dress_at_random(rng)
-    labels = _see(stage, objects, camera, arm, by_shape=not as_twin)
-    colour = stage.draw(camera, arm, shadows=not as_twin and rng.random() < 0.6)
-    if as_twin and rng.random() < 0.6:
-        return Picture(colour=measure_colour(colour, int(rng.integers(2**31)), 0), labels=labels)
-    return Picture(colour=spoil_photo(colour, rng), labels=labels)
+        stage.dress_at_random(rng, objects if look == "own" else ())
+    labels = _see(stage, objects, camera, arm, by_shape=look == "any")
+    colour = stage.draw(camera, arm, shadows=look != "twin" and rng.random() < 0.6)
+    if look == "twin" and rng.random() < 0.6:
+        return Picture(colour=measure_colour(colour, int(rng.integers(2**31)), 0), labels=labels, look=look)
+    return Picture(colour=spoil_photo(colour, rng), labels=labels, look=look)
+
+
+def _choose_look(rng: np.random.Generator, mix: SceneMix) -> Look:
+    share = rng.random()
+    return "twin" if share < mix.twin else "own" if share < mix.twin + mix.own else "any"
 
 
 def draw_scenario(

@@ -6,6 +6,7 @@ Everything that changes from picture to picture (poses, colours, textures, light
 from __future__ import annotations
 
 import os
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import mujoco
@@ -139,8 +140,7 @@ class Stage:
         for number in range(_WALLS):
             model.geom(f"wall_{number}").group = HIDDEN_GROUP
         for actor in self.actors:
-            model.geom_matid[actor.geoms] = -1
-            model.geom_rgba[actor.geoms] = [part.rgba for part, _ in actor.prop.parts]
+            self._dress_in_own_colours(actor)
         model.geom_rgba[self._arm_geoms()] = self._arm_rgba()
         model.light_active[:] = [1] + [0] * (_LIGHTS - 1)
         model.light_type[0] = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
@@ -148,14 +148,16 @@ class Stage:
         model.light_diffuse[0], model.light_specular[0] = [0.62, 0.60, 0.56], [0.25] * 3
         model.vis.headlight.ambient, model.vis.headlight.diffuse = [0.30, 0.30, 0.32], [0.25] * 3
 
-    def dress_at_random(self, rng: np.random.Generator) -> None:
-        """Give everything new colours, textures and lights."""
+    def dress_at_random(self, rng: np.random.Generator, but: Collection[Actor] = ()) -> None:
+        """Give everything new colours, textures and lights; the actors `but` keep their own colours."""
         self._dress_surroundings(rng)
         for number in rng.permutation(_SKINS)[:4]:  # the others keep theirs from earlier pictures
             side = random_texture(rng, _SKIN_PX)
             self._set_texture(f"skin_{number}", np.tile(side, (6, 1, 1)))  # six of its own make a cylinder a box
         for actor in self.actors:
             self._dress_actor(actor, rng)
+        for actor in but:
+            self._dress_in_own_colours(actor)
         tint = np.append(rng.uniform(0.75, 1.2, 3) if rng.random() < 0.5 else np.ones(3), 1.0)
         grey = rng.uniform(0.0, 0.15)
         self.model.geom_rgba[self._arm_geoms()] = np.clip(
@@ -226,6 +228,10 @@ class Stage:
             wall.quat = [np.cos((angle + half) / 2), 0.0, 0.0, np.sin((angle + half) / 2)]
             wall.size = [rng.uniform(0.02, 0.3), rng.uniform(0.2, 1.2), rng.uniform(0.2, 1.2)]
             self._dress_geoms(np.array([wall.id]), rng)
+
+    def _dress_in_own_colours(self, actor: Actor) -> None:
+        self.model.geom_matid[actor.geoms] = -1
+        self.model.geom_rgba[actor.geoms] = [part.rgba for part, _ in actor.prop.parts]
 
     def _dress_actor(self, actor: Actor, rng: np.random.Generator) -> None:
         if actor.prop.kind == "bottle" and rng.random() < 0.7:  # body, label and cap each of one colour

@@ -48,8 +48,9 @@ def data(tmp_path: Path) -> Path:
         [Label(name="cylinder", mask=rectangle(200, 200, 300, 400))],
         [Label(name="bottle", mask=rectangle(500, 60, 600, 200))],
     ]
-    for number, there in enumerate(labels):
-        image, file = tmp_path / f"images/val/1/{number}.jpg", tmp_path / f"labels/val/1/{number}.txt"
+    for number, (look, there) in enumerate(zip(("twin", "own", "any"), labels, strict=True)):
+        name = f"{number}_{look}"
+        image, file = tmp_path / f"images/val/1/{name}.jpg", tmp_path / f"labels/val/1/{name}.txt"
         for path in (image, file):
             path.parent.mkdir(parents=True, exist_ok=True)
         cv2.imwrite(str(image), np.full((*SHAPE, 3), 20 * (number + 1), np.uint8))
@@ -74,6 +75,7 @@ def test_wrong_names_and_masks_that_miss_cost(data: Path) -> None:
 
     renamed = measure_held_out(Oracle(data, rename), data, 500)  # pyright: ignore[reportArgumentType]
     assert float(str(renamed["box_map50"])) < 0.7
+    assert renamed["box_map50_by_look"] == {"any": 0.995, "own": 0.0, "twin": 0.995}
     thinned = measure_held_out(Oracle(data, thin), data, 500)  # pyright: ignore[reportArgumentType]
     assert thinned["box_map50_95"] == pytest.approx(0.995, abs=0.001)
     assert float(str(thinned["mask_map50_95"])) < 0.4

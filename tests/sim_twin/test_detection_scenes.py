@@ -134,7 +134,7 @@ def test_a_bottle_without_its_neck_has_no_label_where_colours_tell_nothing(stage
     seen = {True: 0, False: 0}
     for seed in range(40, 100):
         rng = np.random.default_rng(seed)
-        picture = draw_scene(stage, rng, SceneMix(empty=0.0, twin_look=0.0, wrist=0.0, occluded=0.0))
+        picture = draw_scene(stage, rng, SceneMix(empty=0.0, twin=0.0, own=0.0, wrist=0.0, occluded=0.0))
         camera = stage.T_base_camera("free")
         shown = [a for a in stage.named("bottle") if stage.model.geom_group[a.geoms[0]] != HIDDEN_GROUP]
         masks = [label.mask for label in picture.labels if label.name == "bottle"]
@@ -198,7 +198,7 @@ def test_a_photograph_is_noisy_in_every_channel_and_brought_to_a_fair_exposure()
 @needs_egl
 def test_a_crowd_shows_more_objects(stage: Stage) -> None:
     def shown(crowd: float) -> list[int]:
-        mix = SceneMix(empty=0.0, twin_look=0.0, crowd=crowd)
+        mix = SceneMix(empty=0.0, twin=0.0, own=0.0, crowd=crowd)
         return [len(draw_scene(stage, np.random.default_rng([5, n]), mix).labels) for n in range(8)]
 
     few, many = shown(0.0), shown(1.0)
