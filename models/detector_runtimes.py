@@ -13,7 +13,7 @@ import numpy as np
 
 from models.detector_modules import MODULE_SUFFIXES, exported, load_module
 from models.detector_weights import CAMERA_HW, detector_path
-from models.torch_threads import single_threaded_workers
+from models.torch_threads import has_bfloat16, single_threaded_workers
 from models.weights_file import WeightsError
 
 _PACKAGES = {"openvino": ("openvino",), "onnxruntime": ("onnxruntime",), "torch": ("torch", "ultralytics")}
@@ -153,7 +153,7 @@ class TorchNetwork:
         module = load_module(path)
         self.names, self.input_hw = module.names, module.input_hw
         self._network = module.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        self._quick = torch.cpu._is_avx512_bf16_supported()
+        self._quick = has_bfloat16()
         self._worker = single_threaded_workers(1, "detector")
 
     def run(self, blob: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:

@@ -1,4 +1,4 @@
-"""Threads within which torch starts no threads of its own."""
+"""How torch uses this processor: threads within which it starts none of its own, and bfloat16."""
 
 from __future__ import annotations
 
@@ -25,3 +25,10 @@ def single_threaded_workers(count: int, name: str) -> ThreadPoolExecutor:
     list(workers.map(lambda _: barrier.wait(), range(count)))  # all have begun
     torch.set_num_threads(before)
     return workers
+
+
+def has_bfloat16() -> bool:
+    """Return whether the processor computes in bfloat16; where it only imitates that, float32 is faster."""
+    import torch
+
+    return bool(torch.cpu.get_capabilities().get("avx512_bf16", False))

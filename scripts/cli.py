@@ -15,6 +15,7 @@ COMMANDS = {
     "run": ("scripts.run_runtime", "see, plan and move, against a HAL that runs already"),
     "bench": ("scripts.run_benchmark", "the paper's 81 scenarios: success by method, with intervals"),
     "tune": ("scripts.run_tune", "fit the ranking to logged episodes; keep what is set by hand unless that loses"),
+    "oracle": ("scripts.find_reachable_grasps", "which of the scenarios can be solved at all, by search on the truth"),
     "hal": ("scripts.run_hal", "serve the arm and the camera, with the servo loop and its limits"),
     "calibrate": ("scripts.calibrate", "the wrist camera, with a printed board: hand-eye, intrinsics, touch test"),
     "twin": ("scripts.run_twin", "the twin in place of a device: run-script for pyrealsense2, wire for a Z1's clients"),

@@ -1,30 +1,29 @@
 """Searches all grasps on the true object, in the true scene, by real physics: which scenarios can be solved at all.
 
-.venv/bin/python -m scripts.find_reachable_grasps                          # the paper's 81; some minutes on two cores
-.venv/bin/python -m scripts.find_reachable_grasps --set extended --out out/oracle_extended
-.venv/bin/python -m scripts.find_reachable_grasps --objects bottle --pitches -45 --executions 100
-.venv/bin/python -m scripts.find_reachable_grasps --resume --bench out/bench   # and what the methods make of it
+./z1 oracle                              # the paper's 81; some minutes on two cores
+./z1 oracle --set extended --out out/oracle_extended
+./z1 oracle --objects bottle --pitches -45 --executions 100
+./z1 oracle --resume --bench out/bench   # and what the methods make of it
 """
 
 from __future__ import annotations
 
-import sys
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
 
-import tyro
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
+from scripts.progress import make_progress
 from sim_twin.bench.oracle import METHOD, OracleConfig, OracleTask, run_oracle_task
 from sim_twin.bench.oracle_report import write_report, write_summary
 from sim_twin.bench.rows import Row
 from sim_twin.bench.runner import run_tasks
 from sim_twin.bench.scenarios import OBJECT_SETS, grid
 from sim_twin.bench.store import TABLE, Store
+from sim_twin.bench.summary import plain
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,7 +79,7 @@ def main(config: Config) -> int:
     finally:
         if rows := store.rows():
             store.write_table()
-            run = {"version": version("z1-grasp"), "command": _plain(asdict(config)), "search": asdict(search)}
+            run = {"version": version("z1-grasp"), "command": plain(asdict(config)), "search": asdict(search)}
             summary = write_summary(rows, config.out / "summary.json", run, _others(config.bench))
             write_report(rows, summary, config.out / "report.html")
             _print(console, summary)
@@ -91,18 +90,9 @@ def main(config: Config) -> int:
 def _run(tasks: list[OracleTask], jobs: int, store: Store, console: Console) -> None:
     before = store.rows(["success"])
     solved, searched = sum(bool(row["success"]) for row in before), len(before)
-    columns = (
-        TextColumn("scenarios"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-        TextColumn("{task.description}"),
-    )
     if not tasks:
         return
-    with Progress(*columns, console=console) as progress:
+    with make_progress(console) as progress:
         bar = progress.add_task(f"solved {solved} of {searched}", total=len(tasks))
         for rows in run_tasks(tasks, jobs, run_oracle_task):
             store.add(rows)
@@ -131,16 +121,3 @@ def _print(console: Console, summary: dict[str, Any]) -> None:
         console.print(f"{item['scenario']}: {item['verdict']} after {item['executions']} executions ({modes or '–'})")
     for name, m in summary["methods"].items():
         console.print(f"{name}: {m['solved']} of {m['solvable']} that can be solved, {m['rate_of_solvable']:.1%}")
-
-
-def _plain(value: Any) -> Any:
-    """Return `value` with paths as text, for JSON."""
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    return str(value) if isinstance(value, Path) else value
-
-
-if __name__ == "__main__":
-    sys.exit(main(tyro.cli(Config, description=__doc__)))

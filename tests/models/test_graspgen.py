@@ -92,6 +92,16 @@ def test_drawing_more_than_are_given_out_gives_better_ones_of_as_many_kinds(samp
     assert np.mean(chosen_kinds) > 0.97 * np.mean(drawn_kinds)
 
 
+def test_bfloat16_moves_grasps_by_a_fraction_of_a_millimetre(sampler, monkeypatch):
+    _, points, _ = a_bottle(70)
+    places = []
+    for quick in (False, True):
+        monkeypatch.setattr(sampler, "_quick", quick)
+        places.append(sampler.draw(points, 200, 0).T_camera_grasps[:, :3, 3])
+    apart = np.linalg.norm(places[0] - places[1], axis=1)
+    assert 0.0 < np.median(apart) < 5e-4
+
+
 def test_of_many_alike_the_best_go_first_and_the_best_of_another_kind_is_not_forgotten():
     T = np.tile(np.eye(4), (11, 1, 1))
     T[:, :3, 3] = (0.01, 0.01, 0.01)
