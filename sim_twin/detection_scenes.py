@@ -103,10 +103,7 @@ def draw_scene(stage: Stage, rng: np.random.Generator, mix: SceneMix | None = No
     place_distractors(stage, places, T_base_camera, centre, rng)
     if places and rng.random() < mix.occluded:
         place_occluder(stage, places[0], T_base_camera, rng)
-    if look == "twin":
-        stage.dress_as_twin()
-    else:
-        stage.dress_at_random(rng, objects if look == "own" else ())
+    _dress(stage, look, objects, rng)
     labels = _see(stage, objects, camera, arm, by_shape=look == "any")
     colour = stage.draw(camera, arm, shadows=look != "twin" and rng.random() < 0.6)
     if look == "twin" and rng.random() < 0.6:
@@ -120,16 +117,24 @@ def _choose_look(rng: np.random.Generator, mix: SceneMix) -> Look:
 
 
 def draw_scenario(
-    stage: Stage, name: str, T_base_object: np.ndarray, rng: np.random.Generator, jaw_rad: float = -1.0
+    stage: Stage, name: str, T_base_object: np.ndarray, rng: np.random.Generator, *, look: Look, jaw_rad: float = -1.0
 ) -> Picture:
-    """Return the picture from home of one benchmark object at `T_base_object` (4, 4), in a random look."""
+    """Return the picture from home of one benchmark object at `T_base_object` (4, 4), by the light of any room."""
     stage.clear()
     stage.set_arm(np.append(z1.Q_HOME, jaw_rad))
     actor = stage.named(name)[0]
     stage.put(actor, T_base_object)
-    stage.dress_at_random(rng)
+    _dress(stage, look, [actor], rng)
     labels = _see(stage, [actor], "wrist", "pieces", by_shape=False)
-    return Picture(colour=spoil_photo(stage.draw("wrist", "pieces", shadows=rng.random() < 0.6), rng), labels=labels)
+    colour = stage.draw("wrist", "pieces", shadows=look != "twin" and rng.random() < 0.6)
+    return Picture(colour=spoil_photo(colour, rng), labels=labels, look=look)
+
+
+def _dress(stage: Stage, look: Look, objects: list[Actor], rng: np.random.Generator) -> None:
+    if look == "twin":
+        stage.dress_as_twin()
+    else:
+        stage.dress_at_random(rng, but=objects if look == "own" else ())
 
 
 def outline(corners: list[np.ndarray], T_base_camera: np.ndarray, intrinsics: Intrinsics) -> np.ndarray | None:

@@ -1,6 +1,7 @@
 """The detector's pictures: what the labels say is what the picture shows."""
 
 from collections.abc import Iterator
+from typing import get_args
 
 import mujoco
 import numpy as np
@@ -14,6 +15,7 @@ from sim_twin.detection_scenes import (
     LEAST_MARK_SHARE,
     LEAST_PIXELS,
     LEAST_SHARE,
+    Look,
     SceneMix,
     draw_scenario,
     draw_scene,
@@ -79,7 +81,7 @@ def test_an_empty_scene_has_no_labels(stage: Stage) -> None:
 def test_a_scenario_has_the_mask_that_the_twin_has(stage: Stage, name: str) -> None:
     config = SceneConfig(object=name, distance_m=0.48, lateral_m=-0.15, pitch_deg=45.0)
     pose = config.T_base_object()
-    picture = draw_scenario(stage, name, pose, np.random.default_rng(0))
+    picture = draw_scenario(stage, name, pose, np.random.default_rng(0), look="any")
     world = World(config)
     data = world.snapshot()
     quat = np.empty(4)
@@ -91,6 +93,19 @@ def test_a_scenario_has_the_mask_that_the_twin_has(stage: Stage, name: str) -> N
     renderer.close()
     ours = picture.labels[0].mask
     assert (ours & twin).sum() / (ours | twin).sum() > 0.99
+
+
+@needs_egl
+@pytest.mark.parametrize("look", get_args(Look))
+def test_an_object_has_its_own_colours_unless_any_will_do(stage: Stage, look: Look) -> None:
+    actor, pose = stage.named("cylinder")[0], SceneConfig(object="cylinder").T_base_object()
+    own = [part.rgba for part, _ in actor.prop.parts]
+    alike = []
+    for seed in range(5):
+        assert draw_scenario(stage, "cylinder", pose, np.random.default_rng(seed), look=look).look == look
+        untextured = (stage.model.geom_matid[actor.geoms] < 0).all()
+        alike.append(untextured and np.allclose(stage.model.geom_rgba[actor.geoms], own))
+    assert any(alike) == all(alike) == (look != "any")
 
 
 @needs_egl
