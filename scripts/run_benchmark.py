@@ -62,7 +62,8 @@ class Config:
     generator: str | None = None
     """Grasp generator; the configuration's if not given."""
     detector: str | None = None
-    """Detector; the configuration's if not given. One that knows classes is told each of the paper's objects' own."""
+    """Detector; the configuration's if not given. One that knows classes is told each of the paper's objects' own; what
+    is of no class that it knows is left to `tabletop`, unless the configuration names an object_class."""
     config: Path | None = None
     """A YAML file of settings (see `./z1 show-config`)."""
     jobs: int = 2

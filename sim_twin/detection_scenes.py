@@ -10,6 +10,7 @@ import numpy as np
 
 from hal import z1
 from sim_twin.d405 import measure_colour
+from sim_twin.detection_looks import dress_as_twin, dress_at_random
 from sim_twin.detection_placement import (
     NEAREST_M,
     choose_objects,
@@ -132,9 +133,9 @@ def draw_scenario(
 
 def _dress(stage: Stage, look: Look, objects: list[Actor], rng: np.random.Generator) -> None:
     if look == "twin":
-        stage.dress_as_twin()
+        dress_as_twin(stage)
     else:
-        stage.dress_at_random(rng, but=objects if look == "own" else ())
+        dress_at_random(stage, rng, but=objects if look == "own" else ())
 
 
 def outline(corners: list[np.ndarray], T_base_camera: np.ndarray, intrinsics: Intrinsics) -> np.ndarray | None:

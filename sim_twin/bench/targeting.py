@@ -12,14 +12,15 @@ from models.types import Detection
 from sim_twin.bench.scenarios import Scenario
 from sim_twin.objects import PAPER_OBJECTS
 from z1_runtime.config import RuntimeConfig
-from z1_runtime.detectors import Detector
+from z1_runtime.detectors import Detector, TabletopDetector
 
 
 def aim(config: RuntimeConfig, detector: Detector, scenario: Scenario) -> tuple[RuntimeConfig, Detector]:
     """Return the configuration and the detector with which `scenario` is seen.
 
     A detector that knows the object's class is told it as a user would; one that knows none takes, among neighbours,
-    what covers most of the truth. An object of no class that the detector knows leaves the user's own choice.
+    what covers most of the truth. An object of no class that the detector knows is seen as `object_class` if the user
+    chose one, else by `TabletopDetector`.
 
     Raises:
         ValueError: the detector knows classes, and none for one of the paper's objects.
@@ -27,6 +28,8 @@ def aim(config: RuntimeConfig, detector: Detector, scenario: Scenario) -> tuple[
     if detector.classes and (scenario.object in PAPER_OBJECTS or scenario.object in detector.classes):
         labels_for(scenario.object, detector.classes)  # better refused now than in every episode
         return replace(config, object_class=scenario.object), detector
+    if detector.classes and not config.object_class:
+        detector = TabletopDetector()
     return config, PointedDetector(detector) if scenario.clutter else detector
 
 

@@ -102,11 +102,12 @@ def test_a_detector_that_lacks_a_class_of_the_papers_is_refused():
         aim(RuntimeConfig(), OfCoco(), CLUTTERED)
 
 
-def test_an_object_of_no_class_leaves_the_users_choice_and_is_pointed_at_among_neighbours():
+def test_an_object_of_no_class_is_seen_as_the_user_chose_or_by_its_rising_above_the_table():
     mug = replace(CLUTTERED, object="mug", clutter=0)
     config, detector = aim(RuntimeConfig(object_class="bottle"), Labelled(), mug)
     assert config.object_class == "bottle"
     assert isinstance(detector, Labelled)
+    assert isinstance(aim(RuntimeConfig(), Labelled(), mug)[1], TabletopDetector)
     assert isinstance(aim(RuntimeConfig(), Labelled(), replace(mug, clutter=1))[1], PointedDetector)
 
 
