@@ -150,19 +150,13 @@ def _busy(beside: str, folder: Path) -> Iterator[Callable[[], int]]:
 
 
 def run_vision() -> None:
-    """Look for objects in a frame of the twin's, again and again, and write a byte to stdout each time: by the detector
-    that ships, else by what stands out of the table."""
+    """Look for objects in a frame of the twin's, again and again, and write a byte to stdout each time."""
     from hal.z1 import Q_HOME, T_FLANGE_CAMERA
-    from models.weights_file import WeightsError
     from sim_twin.backends import make_rig
     from z1_runtime.detectors import make_detector
     from z1_runtime.kinematics import Kinematics
 
-    try:
-        detector = make_detector("yolo")
-    except WeightsError as error:
-        print(f"{error} Vision is the table-top detector's for now.", file=sys.stderr)
-        detector = make_detector("tabletop")
+    detector = make_detector("yolo")
     rig = make_rig(lockstep=True)
     rig.camera.connect()
     frame, T_base_camera = rig.camera.wait_for_frame(1.0), Kinematics().flange(Q_HOME) @ T_FLANGE_CAMERA

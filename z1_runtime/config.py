@@ -28,9 +28,9 @@ class ConfigError(ValueError):
 class RuntimeConfig:
     """How a pick is done."""
 
-    detector: str = "tabletop"
-    """Which detector: `tabletop` (whatever rises above the table), `yolo` (learned: bottles, boxes and cylinders), or
-    `truth` (the twin's mask, for evaluation)."""
+    detector: str = "yolo"
+    """Which detector: `yolo` (the learned one that ships: bottles, boxes and cylinders), `tabletop` (whatever rises
+    above the table, no learning), or `truth` (the twin's mask, for evaluation)."""
     detector_weights: str = ""
     """Weights of `yolo`: .npz of ours, .pt of ultralytics, .onnx, OpenVINO's .xml or its folder; empty = ours."""
     detector_runtime: str = "auto"

@@ -228,7 +228,7 @@ DETECTORS = tuple(_DETECTORS)
 """The detectors by name."""
 
 
-def make_detector(name: str = "tabletop", yolo: YoloConfig | None = None) -> Detector:
+def make_detector(name: str, yolo: YoloConfig | None = None) -> Detector:
     """Return the detector of that name; `yolo` is for the one that learned.
 
     Raises:

@@ -157,7 +157,7 @@ def test_candidates_that_all_come_from_behind_leave_no_plan(decider, decision, T
         with_part(decider, generator=FromBehind()).decide(draw_can(T_base_camera), Q)
 
 
-@pytest.mark.parametrize("detector", ["tabletop", "truth"])
+@pytest.mark.parametrize("detector", ["yolo", "tabletop", "truth"])
 def test_warming_up_decides_without_a_camera_whichever_the_detector(detector, caplog):
     with caplog.at_level("INFO", "z1_runtime.decision"):
         make_decider(replace(RuntimeConfig(), detector=detector)).warm_up()

@@ -142,7 +142,7 @@ def test_the_truth_detector_names_the_way_out_when_there_is_no_truth():
 
 
 def test_detectors_are_made_by_name():
-    assert isinstance(make_detector(), TabletopDetector)
+    assert isinstance(make_detector("tabletop"), TabletopDetector)
     assert isinstance(make_detector("truth"), TruthDetector)
     with pytest.raises(ValueError, match="no detector 'yolo9000'; known: tabletop, truth, yolo"):
         make_detector("yolo9000")
