@@ -207,7 +207,7 @@ def twin_views() -> Iterator[tuple[Scenario, Picture]]:
             mujoco.mj_camlight(world.model, data)
             view = renderer.render(data)
             colour = measure_colour(view.colour, scenario.draw_seed, 0)
-            yield scenario, Picture(colour=colour, labels=(Label(name=name, mask=view.mask),))
+            yield scenario, Picture(colour=colour, labels=(Label(name=name, mask=view.mask),), look="twin")
         renderer.close()
 
 

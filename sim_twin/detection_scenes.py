@@ -59,7 +59,8 @@ class Picture:
     """(H, W, 3) uint8, RGB."""
     labels: tuple[Label, ...]
     """Nothing else in the picture is a bottle, a cylinder or a box."""
-    look: Look = "any"
+    look: Look
+    """How it was dressed."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
