@@ -11,7 +11,8 @@ from models.types import GraspGenerator
 GENERATORS = {
     "antipodal": "pairs of visible contacts that face each other; no learning",
     "obb_sweep": "sweeps over the faces of a box around the object; no learning",
-    "diffusion": "the learned one, with the weights that ship",
+    "diffusion": "the learned one, with the weights that ship: for any parallel jaw",
+    "diffusion_z1": "the same for the Z1's own beak",
     "graspgen": "NVIDIA's GraspGen; checkpoints that you bring, non-commercial",
     "graspgenx": "NVIDIA's GraspGenX conditioned on the Z1's gripper; checkpoints that you bring",
 }
@@ -113,6 +114,10 @@ def _make_one(name: str, options: GeneratorOptions, weights: Path | None) -> Gra
         from models.graspgen.sampler import DiffusionConfig, DiffusionSampler
 
         return DiffusionSampler(DiffusionConfig(weights=weights))
+    if name == "diffusion_z1":
+        from models.graspgen.sampler import DiffusionConfig, DiffusionSampler
+
+        return DiffusionSampler(DiffusionConfig(gripper="z1", max_width_m=0.08))
     from models.adapters.nvidia import make_nvidia_generator
 
     return make_nvidia_generator(name, weights, own_process=options.process == "own", python=options.python)

@@ -40,8 +40,9 @@ class RuntimeConfig:
     object_class: str = ""
     """The class to pick, for a detector that knows classes; empty = whatever it is surest of."""
     generator: str = "diffusion"
-    """Which grasp generator: `diffusion` (the learned one that ships), `antipodal`, `obb_sweep` (no learning),
-    `graspgen`, `graspgenx` (NVIDIA's; weights are yours to bring), or `union:a+b` of any of them."""
+    """Which grasp generator: `diffusion` (learned, for any parallel jaw) and `diffusion_z1` (for the Z1's beak) ship;
+    `antipodal`, `obb_sweep` (no learning), `graspgen`, `graspgenx` (NVIDIA's; weights are yours to bring), or
+    `union:a+b` of any of them."""
     generator_weights: str = ""
     """Checkpoint of `graspgen` (.yml) or `graspgenx` (folder), or other weights (.npz) of `diffusion`; empty = ours."""
     generator_process: Process = "in"

@@ -8,6 +8,7 @@ import pytest
 from hal import z1
 from models.antipodal import AntipodalSampler
 from models.generators import make_generator
+from models.graspgen.labels import GRIPPERS
 from models.graspgen.sampler import DiffusionSampler
 from z1_runtime.assembly import make_decider
 from z1_runtime.config import ConfigError, RuntimeConfig, load_config
@@ -18,6 +19,9 @@ from z1_runtime.planner import PlannerConfig
 def test_each_name_makes_its_generator():
     assert isinstance(make_generator("antipodal"), AntipodalSampler)
     assert isinstance(make_generator("diffusion"), DiffusionSampler)
+    beak = make_generator("diffusion_z1")
+    assert isinstance(beak, DiffusionSampler)
+    assert (beak.config.gripper, beak.config.max_width_m) == ("z1", GRIPPERS["z1"].max_width_m)
 
 
 def test_an_unknown_generator_is_refused_with_the_known_ones(tmp_path):
