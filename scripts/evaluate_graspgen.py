@@ -48,7 +48,7 @@ class Config:
     gripper: str = "agnostic"
     """Which hand."""
     shapes: int = 60
-    """Shapes in each set."""
+    """Shapes in each set; 0 measures the time alone and writes nothing."""
     samples: int = 800
     """Grasps of each view."""
     shakes: int = 4
@@ -79,7 +79,8 @@ def main(config: Config) -> None:
         }
         weights = config.diffusion.weights or weights_path(config.gripper)
         report["weights_sha256"] = weights.with_suffix(".sha256").read_text().split()[0]
-    for name, families in (("known families", KNOWN_FAMILIES), ("unseen families", UNSEEN_FAMILIES)):
+    sets = (("known families", KNOWN_FAMILIES), ("unseen families", UNSEEN_FAMILIES)) if config.shapes else ()
+    for name, families in sets:
         for condition, view in CONDITIONS.items():
             clouds = [
                 measure_cloud(
@@ -103,6 +104,8 @@ def main(config: Config) -> None:
         generator = DiffusionSampler(replace(config.diffusion, gripper=config.gripper, threads=config.latency_threads))
     report["latency"] = measure_latency(generator, config.samples)
     console.print(report["latency"])
+    if not config.shapes:
+        return
     out = config.out or weights_path(config.gripper).with_suffix(".json")
     out.write_text(json.dumps(report, indent=1, ensure_ascii=False) + "\n")
 
