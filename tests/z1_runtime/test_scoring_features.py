@@ -85,20 +85,20 @@ def test_a_decider_reads_the_file_that_its_configuration_names(tmp_path):
         return make_decider(replace(config, n_candidates=200))
 
     q = np.append(z1.Q_HOME, -1.0)
-    plain = decider(RuntimeConfig())
+    plain = decider(RuntimeConfig(detector="tabletop"))
     frame = draw_can(plain.kinematics.flange(z1.Q_HOME) @ z1.T_FLANGE_CAMERA)
     by_hand = plain.decide(frame, q).ranked
 
     path = tmp_path / "scoring.yaml"
     save_scoring(Scoring(mvb=Ranking(), full=plain.ranking), path)
-    same = decider(RuntimeConfig(scoring=str(path))).decide(frame, q).ranked
+    same = decider(RuntimeConfig(detector="tabletop", scoring=str(path))).decide(frame, q).ranked
     assert same.indices.tolist() == by_hand.indices.tolist()
 
     save_scoring(Scoring(mvb=Ranking(), full=replace(plain.ranking, k_faces=1, head=HIGHER_IS_BETTER)), path)
-    fitted = decider(RuntimeConfig(scoring=str(path))).decide(frame, q).ranked
+    fitted = decider(RuntimeConfig(detector="tabletop", scoring=str(path))).decide(frame, q).ranked
     assert 0 < len(fitted) < len(by_hand)
     assert fitted.indices[0] != by_hand.indices[0]
 
     path.write_text("format: other")
     with pytest.raises(ScoringError, match="no scoring file"):
-        decider(RuntimeConfig(scoring=str(path)))
+        decider(RuntimeConfig(detector="tabletop", scoring=str(path)))

@@ -30,7 +30,7 @@ def file(tmp_path):
 
 @pytest.fixture(scope="module")
 def decider():
-    return make_decider(RuntimeConfig(n_candidates=200))
+    return make_decider(RuntimeConfig(detector="tabletop", n_candidates=200))
 
 
 @pytest.fixture(scope="module")
