@@ -110,14 +110,13 @@ def _make_one(name: str, options: GeneratorOptions, weights: Path | None) -> Gra
         from models.adapters.obb_sweep import ObbSweepSampler
 
         return ObbSweepSampler()
-    if name == "diffusion":
+    if name in ("diffusion", "diffusion_z1"):
+        from models.graspgen.labels import GRIPPERS
         from models.graspgen.sampler import DiffusionConfig, DiffusionSampler
 
-        return DiffusionSampler(DiffusionConfig(weights=weights))
-    if name == "diffusion_z1":
-        from models.graspgen.sampler import DiffusionConfig, DiffusionSampler
-
-        return DiffusionSampler(DiffusionConfig(gripper="z1", max_width_m=0.08))
+        gripper = "agnostic" if name == "diffusion" else "z1"
+        width_m = GRIPPERS[gripper].max_width_m
+        return DiffusionSampler(DiffusionConfig(gripper=gripper, weights=weights, max_width_m=width_m))
     from models.adapters.nvidia import make_nvidia_generator
 
     return make_nvidia_generator(name, weights, own_process=options.process == "own", python=options.python)

@@ -1,6 +1,6 @@
 """Measures the detector on held-out pictures and on the 81 scenario views; writes `models/weights/detector.json`.
 
-    nice -n 10 python -m scripts.evaluate_detector                  # some minutes on one core
+    nice -n 10 python -m scripts.evaluate_detector                  # a minute on two cores
     python -m scripts.evaluate_detector --weights some.npz --out out/detector/some.json
 
 Held-out pictures come from `make_detection_dataset`: other seeds, so other props, textures and lights. A picture with

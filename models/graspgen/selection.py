@@ -16,8 +16,8 @@ def choose_grasps(T: np.ndarray, scores: np.ndarray, n: int) -> np.ndarray:
 
     A grasp with chance c is worth c^1.5 · (1 + 4 m), m being the chance that nothing better near it holds: so the best
     of each place goes before the twentieth of another, and coverage does not suffer for a higher share that holds.
-    Near are grasps within 1 cm that approach and close alike within 15°. Measured on 60 held-out clouds, 800 of 1600:
-    finer cells, larger ones and other weights lose in coverage or in the share that holds.
+    Near are grasps within 1 cm that approach and close alike within 15°. These numbers were chosen among 13 settings on
+    30 of the held-out clouds of known families; those of unseen families had no say.
 
     Args:
         T: (M, 4, 4) grasps, M ≥ n.
