@@ -9,7 +9,7 @@ from numba import njit
 
 from hal import z1
 from hal.z1_shape import CAPSULE_PAIRS, CAPSULES, GRIPPER_OBSTACLES, TABLE_LINKS
-from z1_runtime.gripper import mover_pose
+from z1_runtime.beak import mover_pose
 from z1_runtime.kinematics import Kinematics
 from z1_runtime.robot_model import gripper_shape
 from z1_runtime.types import Plane

@@ -10,8 +10,8 @@ from hal import z1
 from hal.z1_shape import CAPSULES
 from z1_runtime import arm_collision
 from z1_runtime.arm_collision import MAY_MEET_SCENE, ArmPoses, Problem, first_arm_problem
+from z1_runtime.beak import mover_pose
 from z1_runtime.cloud import transform
-from z1_runtime.gripper import mover_pose
 from z1_runtime.kinematics import Kinematics
 from z1_runtime.robot_model import gripper_shape
 from z1_runtime.types import JointTrajectory, Observation, Plane

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from z1_runtime.gripper import PAD_HALF_WIDTH_M
+from z1_runtime.beak import PAD_HALF_WIDTH_M
 
 _PALM_HALF_WIDTH_M = 0.041
 _ASIDE_M = 0.005  # what stands out this far beside the width still goes towards the palm between the jaws

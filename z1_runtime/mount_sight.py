@@ -17,8 +17,8 @@ from scipy.spatial.transform import Rotation
 
 from hal import z1
 from hal.messages import RgbdFrame
+from z1_runtime.beak import mover_pose
 from z1_runtime.cloud import transform
-from z1_runtime.gripper import mover_pose
 from z1_runtime.own_gripper import OwnGripper
 from z1_runtime.robot_model import T_PIVOT_STATOR
 from z1_runtime.se3 import inverse

@@ -9,8 +9,8 @@ import numpy as np
 
 from hal import z1
 from hal.messages import Intrinsics, RgbdFrame
+from z1_runtime.beak import mover_pose
 from z1_runtime.cloud import transform
-from z1_runtime.gripper import mover_pose
 from z1_runtime.robot_model import gripper_shape
 from z1_runtime.se3 import inverse
 

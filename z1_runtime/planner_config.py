@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from z1_runtime.ability_config import AbilityConfig
+from z1_runtime.beak import BeakConfig
 from z1_runtime.collision import CollisionConfig
-from z1_runtime.gripper import BeakConfig
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 
 from hal import z1
-from z1_runtime.gripper import PALM_RADIUS_M
+from z1_runtime.beak import PALM_RADIUS_M
 from z1_runtime.voxels import spread_first
 
 T_PIVOT_STATOR = np.eye(4)

@@ -15,10 +15,10 @@ from calibration.board import Board
 from hal import z1
 from hal.arm import ServoedArm
 from hal.clock import Clock
+from z1_runtime.beak import JAW_REACH_M, STATOR_FACE
 from z1_runtime.calibration_poses import plan_way
 from z1_runtime.collision import CollisionChecker
 from z1_runtime.executor import Executor
-from z1_runtime.gripper import JAW_REACH_M, STATOR_FACE
 from z1_runtime.kinematics import Kinematics
 from z1_runtime.se3 import inverse, make_pose
 from z1_runtime.trajectory import MotionLimits, PathFailure, straight_move

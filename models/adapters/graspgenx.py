@@ -42,7 +42,7 @@ Z1_GRIPPER: dict[str, Any] = {
 }
 """The Z1's beak as GraspGenX describes grippers (a `config.json`): z approach, x closing, origin at GripperStator [m].
 
-From the URDF and the faces measured in `z1_runtime/gripper.py`, to which a test holds it: the mover's axis is 49 mm
+From the URDF and the faces measured in `z1_runtime/beak.py`, to which a test holds it: the mover's axis is 49 mm
 beyond the origin, the palm reaches 33 mm and the fingertips 100 mm beyond that, the knees that touch stand 76.7 mm from
 the axis, pads are 52 mm wide. `BeakGripper` lays the beak so that both jaws lean alike on an object, hence a box
 symmetric in x: as wide as the knees are apart at the opening for the widest object (65 mm, 0.88 rad), and at half of

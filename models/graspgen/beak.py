@@ -22,7 +22,7 @@ FIXED_FACE = (
     (0.0430, -0.0188),
     (0.0323, -0.0185),
 )
-"""x, z of the fixed jaw's inner face in the pivot frame, tip first [m]; as in `z1_runtime/gripper.py`, from the
+"""x, z of the fixed jaw's inner face in the pivot frame, tip first [m]; as in `z1_runtime/beak.py`, from the
 collision meshes of the Z1's description."""
 TURNING_FACE = (
     (0.1000, -0.0090),

@@ -19,11 +19,12 @@ from sim_twin.world import GRIPPER_START_RAD
 from z1_runtime import collision, fitting
 from z1_runtime.ability import AbilityRanking
 from z1_runtime.arm_collision import Problem
+from z1_runtime.beak import BeakConfig
 from z1_runtime.candidates import Candidates, Way
 from z1_runtime.cloud import transform
 from z1_runtime.collision import CollisionChecker, CollisionConfig
 from z1_runtime.grasp_motion import MotionPlanner
-from z1_runtime.gripper import BeakConfig, BeakGripper
+from z1_runtime.gripper import BeakGripper
 from z1_runtime.kinematics import Kinematics
 from z1_runtime.planner_config import PlannerConfig
 from z1_runtime.trajectory import MotionLimits

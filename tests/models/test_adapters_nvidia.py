@@ -13,7 +13,7 @@ from models.adapters.graspgenx import Z1_GRIPPER, sweep_numbers
 from models.adapters.nvidia import NvidiaSampler, make_nvidia_generator
 from models.adapters.torch_patches import compiled_ops_replaced, cuda_only_if_there, drawn_from, fold_attention
 from models.generators import GeneratorOptions, generator_for, make_generator, split_generator_name
-from z1_runtime import gripper
+from z1_runtime import beak
 
 CLOUD = np.random.default_rng(0).uniform([-0.03, -0.05, 0.38], [0.03, 0.05, 0.42], (500, 3))
 DEPTH_M = 0.195
@@ -172,17 +172,17 @@ def test_the_compiled_ops_are_stood_in_for_only_while_asked():
 def test_the_z1_s_twelve_numbers_are_those_of_its_measured_beak():
     to_axis_m = 0.049  # GripperStator to jointGripper in the URDF
     boxes = []
-    opened = 2.0 * np.arcsin(0.065 / 2.0 / gripper.KNEE_RADIUS_M)  # both knees touch 65 mm
+    opened = 2.0 * np.arcsin(0.065 / 2.0 / beak.KNEE_RADIUS_M)  # both knees touch 65 mm
     for angle in (opened, opened / 2.0):
-        between_knees = 2.0 * gripper.KNEE_RADIUS_M * np.sin(angle / 2.0)
-        tips = to_axis_m + gripper.JAW_REACH_M * np.cos(angle / 2.0)
-        palm = to_axis_m + gripper.PALM_RADIUS_M
-        boxes += [between_knees, 2.0 * gripper.PAD_HALF_WIDTH_M, tips - palm, 0.0, 0.0, (tips + palm) / 2.0]
+        between_knees = 2.0 * beak.KNEE_RADIUS_M * np.sin(angle / 2.0)
+        tips = to_axis_m + beak.JAW_REACH_M * np.cos(angle / 2.0)
+        palm = to_axis_m + beak.PALM_RADIUS_M
+        boxes += [between_knees, 2.0 * beak.PAD_HALF_WIDTH_M, tips - palm, 0.0, 0.0, (tips + palm) / 2.0]
     assert sweep_numbers() == pytest.approx(boxes, abs=6e-4)
     assert Z1_GRIPPER["open"]["jointGripper"] == pytest.approx(-opened, abs=0.01)
     volume = Z1_GRIPPER["sweep_volume"]
     assert Z1_GRIPPER["fingertip"][2] == pytest.approx(volume["offset"][2] + volume["extents"][2] / 2.0)
-    assert Z1_GRIPPER["bbox"][1][2] == pytest.approx(to_axis_m + gripper.JAW_REACH_M)
+    assert Z1_GRIPPER["bbox"][1][2] == pytest.approx(to_axis_m + beak.JAW_REACH_M)
 
 
 def test_the_urdf_has_the_mover_s_axis_where_the_description_has_it():

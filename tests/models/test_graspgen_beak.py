@@ -7,8 +7,8 @@ from models.graspgen import beak
 from models.graspgen.labels import GRIPPERS, check_grasps, find_grasps
 from models.graspgen.shapes import make_shape
 from models.graspgen.solids import BOX, make_part, make_solid
-from z1_runtime import gripper
-from z1_runtime.gripper import BeakConfig, BeakGripper
+from z1_runtime.beak import MOVER_FACE, STATOR_FACE, BeakConfig
+from z1_runtime.gripper import BeakGripper
 from z1_runtime.robot_model import gripper_shape
 
 HAND = GRIPPERS["z1"]
@@ -39,8 +39,8 @@ def test_the_beak_lies_as_the_runtime_lays_it():
 
 
 def test_its_faces_are_those_of_the_runtime():
-    assert np.array(beak.FIXED_FACE) == pytest.approx(gripper.STATOR_FACE[: len(beak.FIXED_FACE)])
-    assert np.array(beak.TURNING_FACE) == pytest.approx(gripper.MOVER_FACE)
+    assert np.array(beak.FIXED_FACE) == pytest.approx(STATOR_FACE[: len(beak.FIXED_FACE)])
+    assert np.array(beak.TURNING_FACE) == pytest.approx(MOVER_FACE)
 
 
 def test_its_outer_sides_are_those_of_the_meshes():

@@ -7,7 +7,7 @@ import numpy as np
 from hal import z1
 from hal.messages import Intrinsics, RgbdFrame
 from models.types import Detection, GraspSet
-from z1_runtime.gripper import BeakConfig
+from z1_runtime.beak import BeakConfig
 from z1_runtime.kinematics import Kinematics
 from z1_runtime.se3 import inverse
 from z1_runtime.types import Observation, Plane

@@ -7,16 +7,8 @@ import pytest
 import trimesh
 
 from hal import z1
-from z1_runtime.gripper import (
-    JAW_REACH_M,
-    KNEE_RADIUS_M,
-    MOVER_FACE,
-    STATOR_FACE,
-    BeakConfig,
-    BeakGripper,
-    WidthError,
-    mover_pose,
-)
+from z1_runtime.beak import JAW_REACH_M, KNEE_RADIUS_M, MOVER_FACE, STATOR_FACE, BeakConfig, mover_pose
+from z1_runtime.gripper import BeakGripper, WidthError
 from z1_runtime.se3 import inverse
 
 TIGHT = BeakConfig(clearance_m=0.0)
