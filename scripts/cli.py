@@ -32,7 +32,8 @@ without `Config` takes the bare arguments: `main(list[str]) -> int`."""
 ROOMS = ("hal", "models", "calibration", "z1_runtime", "sim_twin", "scripts")
 
 BAD_INPUT = {"ConfigError", "ScoringError", "TuneError", "UnknownBackendError", "ViewerPortError"}
-"""Errors of ours that say the call was wrong, not that the work failed; so is a plain `ValueError` of our own."""
+"""Errors of ours that say the call was wrong, not that the work failed; so are a plain `ValueError` and
+a `FileExistsError` of our own."""
 
 FAILED, BAD_USAGE, INTERRUPTED = 1, 2, 130
 
@@ -91,7 +92,7 @@ def is_for_the_user(error: BaseException) -> bool:
 
 
 def _is_bad_input(error: BaseException) -> bool:
-    return type(error) is ValueError or type(error).__name__ in BAD_INPUT
+    return type(error) in (ValueError, FileExistsError) or type(error).__name__ in BAD_INPUT
 
 
 def _raised_in(traceback_: TracebackType | None) -> str:

@@ -8,6 +8,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -16,6 +17,7 @@ from typing import Any, Literal
 from rich.console import Console
 from rich.table import Table
 
+from scripts import cli
 from scripts.progress import make_progress
 from sim_twin.bench.oracle import METHOD, OracleConfig, OracleTask, run_oracle_task
 from sim_twin.bench.oracle_report import write_report, write_summary
@@ -121,3 +123,7 @@ def _print(console: Console, summary: dict[str, Any]) -> None:
         console.print(f"{item['scenario']}: {item['verdict']} after {item['executions']} executions ({modes or '–'})")
     for name, m in summary["methods"].items():
         console.print(f"{name}: {m['solved']} of {m['solvable']} that can be solved, {m['rate_of_solvable']:.1%}")
+
+
+if __name__ == "__main__":
+    sys.exit(cli.main(["oracle", *sys.argv[1:]]))

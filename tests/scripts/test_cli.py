@@ -93,7 +93,8 @@ def test_options_reach_the_command_and_its_code_comes_back(made_up: ModuleType) 
         ("numpy", DegenerateCloudError("four points at least"), 1),
         ("hal.registry", UnknownBackendError("arm", "x", ["mock"]), 2),
         ("z1_runtime.config", ValueError("alpha is 3"), 2),
-        ("scripts.run_demo", FileExistsError("out is a file"), 1),
+        ("scripts.run_demo", PermissionError("out cannot be written"), 1),
+        ("sim_twin.bench.store", FileExistsError("out holds rows already"), 2),
     ],
 )
 def test_error_for_the_user_is_one_line(

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from models.types import Detection
-from scripts.evaluate_detector import box_iou, label_file, mask_iou, match, measure_empty, measure_held_out
+from scripts.detection_measures import box_iou, mask_iou, match
+from scripts.evaluate_detector import label_file, measure_empty, measure_held_out
 from scripts.make_detection_dataset import read_labels, to_line
 from sim_twin.detection_scenes import Label
 
