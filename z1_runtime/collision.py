@@ -63,7 +63,7 @@ class CollisionConfig:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GripperHits:
-    """What each of N gripper poses hits."""
+    """What each of N gripper poses hits: the first of table, scene and object; what comes after that is not asked."""
 
     height_m: np.ndarray
     """(N,) lowest point over the table [m]."""
@@ -160,8 +160,9 @@ class CollisionChecker:
         T_base_movers = T_base_pivots @ mover_pose(jaws)
         parts = ((T_base_pivots, self._shape.fixed), (T_base_movers, self._shape.mover))
         height = np.min([self._lowest(T, vertices) for T, vertices in parts], axis=0)
-        scene = self._hits(self.scene_index, parts, scene_m)
-        hit_object = self._hits(self.object_index, parts, object_m)
+        clear = height >= config.table_margin_m
+        scene = self._hits(self.scene_index, parts, scene_m, clear)
+        hit_object = self._hits(self.object_index, parts, object_m, clear & np.isnan(scene[:, 0]))
         return GripperHits(height, scene, hit_object, config.table_margin_m)
 
     def spare_height_m(self, T_base_pivots: np.ndarray, jaws: np.ndarray) -> np.ndarray:
@@ -227,13 +228,15 @@ class CollisionChecker:
         up = self.table.normal
         return (up @ T[:, :3, :3] @ vertices.T).min(axis=1) + T[:, :3, 3] @ up - self.table.offset_m
 
-    def _hits(self, index: SceneIndex, parts: tuple, threshold_m: float) -> np.ndarray:
-        found = np.full((len(parts[0][0]), 3), np.nan)
+    def _hits(self, index: SceneIndex, parts: tuple, threshold_m: float, asked: np.ndarray) -> np.ndarray:
+        """Return a point (N, 3) that each pose hits with any of `parts`; NaN where none is, or where not `asked`."""
+        found = np.full((len(asked), 3), np.nan)
         if threshold_m < 0.0 or not len(index):
             return found
         for T, vertices in parts:
-            _, hit = index.first_hits(T, vertices, threshold_m)
-            found[hit >= 0] = index.points[hit[hit >= 0]]
+            rows = np.flatnonzero(asked & np.isnan(found[:, 0]))
+            _, hit = index.first_hits(T[rows], vertices, threshold_m)
+            found[rows[hit >= 0]] = index.points[hit[hit >= 0]]
         return found
 
     def _gripper_points(self, q: np.ndarray) -> np.ndarray:
