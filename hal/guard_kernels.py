@@ -39,8 +39,8 @@ def _apply(T, p, out):
 
 
 @njit(cache=True, nogil=True)
-def _point_distance(p, a, b):
-    """Return the distance of point `p` from segment `a` `b`."""
+def squared_distance(p, a, b):
+    """Return the squared distance of point `p` from segment `a` `b`."""
     along, length = 0.0, 0.0
     for i in range(3):
         along += (p[i] - a[i]) * (b[i] - a[i])
@@ -49,7 +49,7 @@ def _point_distance(p, a, b):
     total = 0.0
     for i in range(3):
         total += (p[i] - a[i] - t * (b[i] - a[i])) ** 2
-    return np.sqrt(total)
+    return total
 
 
 @njit(cache=True, nogil=True)
@@ -113,5 +113,5 @@ def measure_margins(q, joints, lower, upper, T_flange_pivot):
                 box[k] = min(box[k], point[a] - lower[a], upper[a] - point[a])
             for c in range(len(_RADII)):
                 if _MAY_MEET_HAND[c]:
-                    own[k] = min(own[k], _point_distance(point, ends[c, 0], ends[c, 1]) - _RADII[c])
+                    own[k] = min(own[k], np.sqrt(squared_distance(point, ends[c, 0], ends[c, 1])) - _RADII[c])
     return box, table, own

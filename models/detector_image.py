@@ -14,6 +14,8 @@ import numpy as np
 from models.types import Detection
 
 _GREY = 114
+_STRIDES = (8, 16, 32)
+"""Pixels from anchor to anchor, in the order of a YOLOv8's outputs; each level goes row by row."""
 _MAX_CANDIDATES = 1000
 """Boxes that enter the suppression; a trained network has some dozens above its threshold."""
 
@@ -103,6 +105,37 @@ def read_outputs(
         label, confidence = names[int(scores.argmax())], float(scores.max())
         found.append(Detection(label=label, confidence=confidence, box_px=edges, mask=mask))
     return found
+
+
+def n_anchors(input_hw: tuple[int, int]) -> int:
+    """Return how many anchors a YOLOv8 has for an input (H, W) [px]."""
+    return sum((input_hw[0] // stride) * (input_hw[1] // stride) for stride in _STRIDES)
+
+
+def mean_of_mirrored(rows: np.ndarray, mirrored: np.ndarray, n_classes: int, input_hw: tuple[int, int]) -> np.ndarray:
+    """Return the mean of what a network says of an input and of its mirror image.
+
+    Boxes and confidences are averaged anchor by anchor, each with the anchor at the mirrored place. The weights of
+    the prototypes stay: the mirror image's belong to prototypes of its own.
+
+    Args:
+        rows: (4 + C + M, A) of the input, see `read_outputs`.
+        mirrored: (4 + C + M, A) of the input mirrored left to right.
+        n_classes: C.
+        input_hw: (H, W) of the input [px].
+    """
+    height, width = input_hw
+    n_rows, levels, first = 4 + n_classes, [], 0
+    for stride in _STRIDES:
+        h, w = height // stride, width // stride
+        level = mirrored[:n_rows, first : first + h * w].reshape(n_rows, h, w)
+        levels.append(level[..., ::-1].reshape(n_rows, h * w))
+        first += h * w
+    back = np.concatenate(levels, axis=1)
+    back[0] = width - back[0]
+    mean = rows.copy()
+    mean[:n_rows] = (rows[:n_rows] + back) / 2
+    return mean
 
 
 def _suppressed(rows: np.ndarray, n_classes: int, min_confidence: float, max_iou: float) -> np.ndarray:

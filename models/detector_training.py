@@ -41,6 +41,7 @@ PHASES = (
     Phase(imgsz=256, epochs=6, lr0=1.3e-3, lrf=0.8, warmup_epochs=0.2, batch=16),
     Phase(imgsz=320, epochs=11, lr0=1.1e-3, lrf=0.04, warmup_epochs=0.2, batch=16),
     Phase(imgsz=320, epochs=24, lr0=1.2e-3, lrf=0.02, warmup_epochs=0.2, batch=16),
+    Phase(imgsz=320, epochs=22, lr0=1.2e-3, lrf=0.02, warmup_epochs=0.2, batch=16),
 )
 """Small pictures teach most of it at a fraction of the time; the last have the size at which the network is used."""
 

@@ -27,7 +27,7 @@ from sim_twin.detection_scenes import Label, Picture, SceneMix
 SPLITS = {"train": 1_000_000, "val": 2_000_000, "empty": 3_000_000}
 """Name to the first seed: no two splits share a seed, so neither props, textures nor lights."""
 
-_CHANGES = {"train": {"crowd": 0.75, "empty": 0.05}, "empty": {"empty": 1.0}}
+_CHANGES = {"train": {"crowd": 0.75, "empty": 0.05, "twin": 0.25, "own": 0.35}, "empty": {"empty": 1.0}}
 """In what the splits differ from the mix."""
 
 

@@ -69,7 +69,7 @@ def _dress_surroundings(stage: Stage, rng: np.random.Generator) -> None:
         wall.pos = [far * np.cos(angle), far * np.sin(angle), rng.uniform(-0.5, 0.6)]
         half = rng.uniform(-0.5, 0.5)
         wall.quat = [np.cos((angle + half) / 2), 0.0, 0.0, np.sin((angle + half) / 2)]
-        wall.size = [rng.uniform(0.02, 0.3), rng.uniform(0.2, 1.2), rng.uniform(0.2, 1.2)]
+        wall.size = [rng.uniform(0.02, 0.1), *rng.uniform(0.6, 1.5, 2)]  # a small one, far off, would be a box
         _dress_geoms(model, np.array([wall.id]), rng)
 
 

@@ -147,7 +147,7 @@ def _make_disc(rng: np.random.Generator) -> Prop:
 
 
 def _make_stick(rng: np.random.Generator) -> Prop:
-    return _prop("stick", _part("cylinder", (rng.uniform(0.003, 0.008), rng.uniform(0.06, 0.14))))
+    return _prop("stick", _part("cylinder", (rng.uniform(0.003, 0.006), rng.uniform(0.06, 0.14))))
 
 
 def _make_angle(rng: np.random.Generator) -> Prop:

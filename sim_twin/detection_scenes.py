@@ -32,7 +32,8 @@ LEAST_PIXELS = 600
 LEAST_SHARE = 0.5
 """So is one that shows less of its outline, unless it fills `_LARGE_SHARE` of the picture."""
 LEAST_MARK_SHARE = 0.5
-"""So is a bottle in random colours that shows less of its neck: nothing else tells it from a cylinder."""
+"""So is a mug that shows less of its handle, and a bottle in random colours that shows less of its neck: nothing else
+tells either from a cylinder."""
 _LARGE_SHARE = 0.15
 
 
@@ -98,7 +99,7 @@ def draw_scene(stage: Stage, rng: np.random.Generator, mix: SceneMix | None = No
         if rng.random() < mix.empty
         else choose_objects(stage, rng, nominal=mix.nominal if look == "any" else 1.0, crowd=crowd)
     )
-    end_on = look == "twin"
+    end_on = look != "any"
     places = place_objects(
         stage, objects, T_base_camera, centre=centre, by_wrist=by_wrist, crowd=crowd, end_on=end_on, rng=rng
     )
@@ -176,31 +177,49 @@ def _see(stage: Stage, objects: list[Actor], camera: str, arm: str, *, by_shape:
         by_shape: the objects' colours say nothing, so that shape alone must tell what they are.
     """
     shown = list(objects)
+    mugs = [actor for actor in stage.distractors() if actor.prop.kind == "mug" and stage.shows(actor)]
     T_base_camera = stage.T_base_camera(camera)
     while True:
         instances = stage.draw_instances(camera, arm)
-        pixels = {id(actor): instances == stage.actors.index(actor) for actor in shown}
+        pixels = {id(actor): instances == stage.actors.index(actor) for actor in shown + mugs}
         hardly = [
             actor for actor in shown if _shows_too_little(stage, actor, pixels[id(actor)], T_base_camera, by_shape)
         ]
+        hardly += [actor for actor in mugs if not _shows_mark(stage, actor, pixels[id(actor)], T_base_camera)]
         if not hardly:
             return tuple(Label(name=actor.prop.kind, mask=pixels[id(actor)]) for actor in shown)
         for actor in hardly:
             stage.hide(actor)
-            shown.remove(actor)
+            (mugs if actor in mugs else shown).remove(actor)
 
 
 def _shows_too_little(stage: Stage, actor: Actor, mask: np.ndarray, T_base_camera: np.ndarray, by_shape: bool) -> bool:
     seen = int(mask.sum())
     if seen < LEAST_PIXELS:
         return True
-    pose = stage.pose(actor)
-    corners = [points @ pose[:3, :3].T + pose[:3, 3] for points in actor.prop.corners()]
-    whole = outline(corners, T_base_camera, stage.intrinsics)
+    whole = outline(_corners_in_base(stage, actor), T_base_camera, stage.intrinsics)
     if whole is None:
         return True
-    if by_shape and actor.prop.kind == "bottle":
-        mark = outline(corners[-2:], T_base_camera, stage.intrinsics)  # neck and cap
-        if mark is None or seen_share(mask, mark) < LEAST_MARK_SHARE:
-            return True
+    if by_shape and actor.prop.kind == "bottle" and not _shows_mark(stage, actor, mask, T_base_camera):
+        return True
     return seen < LEAST_SHARE * 4 * int(np.count_nonzero(whole)) and seen < _LARGE_SHARE * mask.size
+
+
+def _shows_mark(stage: Stage, actor: Actor, mask: np.ndarray, T_base_camera: np.ndarray) -> bool:
+    """True when the pixels `mask` show enough of what tells a bottle or a mug from a cylinder: neck and cap, handle."""
+    corners = _corners_in_base(stage, actor)
+    parts = slice(-2, None) if actor.prop.kind == "bottle" else slice(2, None)
+    mark = outline(corners[parts], T_base_camera, stage.intrinsics)
+    if mark is None:
+        return False
+    if actor.prop.kind == "mug":  # a handle in front of the mug, or behind it, is not seen
+        body = outline(corners[:2], T_base_camera, stage.intrinsics)
+        if body is None or np.count_nonzero(mark & ~body) < LEAST_MARK_SHARE * np.count_nonzero(mark):
+            return False
+        mark &= ~body
+    return seen_share(mask, mark) >= LEAST_MARK_SHARE
+
+
+def _corners_in_base(stage: Stage, actor: Actor) -> list[np.ndarray]:
+    pose = stage.pose(actor)
+    return [points @ pose[:3, :3].T + pose[:3, 3] for points in actor.prop.corners()]

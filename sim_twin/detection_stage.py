@@ -90,6 +90,10 @@ class Stage:
         """Take `actor` off the stage."""
         self.model.geom_group[actor.geoms] = HIDDEN_GROUP
 
+    def shows(self, actor: Actor) -> bool:
+        """Return whether `actor` is on the stage."""
+        return bool(self.model.geom_group[actor.geoms[0]] == GROUP_SCENE)
+
     def put(self, actor: Actor, T_base_prop: np.ndarray) -> None:
         """Show `actor` at `T_base_prop` (4, 4)."""
         self.model.geom_group[actor.geoms] = GROUP_SCENE

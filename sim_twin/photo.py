@@ -35,11 +35,11 @@ def spoil_photo(colour: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 def _expose(colour: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Gain, gamma, white balance and black level, through one table for each channel.
 
-    The gain aims at a mean of 60 to 165, as automatic exposure does, and reaches it within a factor of 0.6 to 3.5.
+    The gain aims at a mean of 60 to 165, as automatic exposure does, and reaches it by a factor of 0.6 to 8.
     """
     level = np.arange(256, dtype=np.float64) / 255
     balance = rng.uniform(0.82, 1.18, 3) if rng.random() < 0.6 else np.ones(3)
-    gain = np.clip(rng.uniform(60, 165) / max(float(colour[::8, ::8].mean()), 1.0), 0.6, 3.5)
+    gain = np.clip(rng.uniform(60, 165) / max(float(colour[::8, ::8].mean()), 1.0), 0.6, 8.0)
     table = level[:, None] ** rng.uniform(0.7, 1.3) * balance * gain
     table = np.clip(table + rng.uniform(-0.04, 0.08), 0.0, 1.0) * 255
     return cv2.LUT(colour, table[None].astype(np.float32))

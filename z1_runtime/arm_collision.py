@@ -8,6 +8,7 @@ import numpy as np
 from numba import njit
 
 from hal import z1
+from hal.guard_kernels import segment_distance, squared_distance
 from hal.z1_shape import CAPSULE_PAIRS, CAPSULES, GRIPPER_OBSTACLES, TABLE_LINKS
 from z1_runtime.beak import mover_pose
 from z1_runtime.kinematics import Kinematics
@@ -91,24 +92,9 @@ def first_arm_problem(poses: ArmPoses, table: Plane, link_margin_m: float) -> Pr
 def warm_up() -> None:
     """Load what is compiled, so that the first check is as fast as the next."""
     pose, read_only = np.eye(4)[None], gripper_shape().fixed[:1]
-    ends = np.zeros((1, 1, 2, 3))
+    ends = np.array([[[(0.0, 0.0, 0.0), (1.0, 0.0, 0.0)]]])
     _first_capsule_hit(pose, read_only, ends, np.zeros(1))
     _first_capsule_pair(ends, np.zeros(1), np.zeros((1, 2), dtype=np.int64))
-
-
-@njit(cache=True, nogil=True)
-def _squared_distance(p, a, b):
-    """Return the squared distance of point `p` from segment `a` `b`."""
-    along = 0.0
-    length = 0.0
-    for i in range(3):
-        along += (p[i] - a[i]) * (b[i] - a[i])
-        length += (b[i] - a[i]) ** 2
-    t = 0.0 if length <= 0.0 else min(max(along / length, 0.0), 1.0)
-    total = 0.0
-    for i in range(3):
-        total += (p[i] - a[i] - t * (b[i] - a[i])) ** 2
-    return total
 
 
 @njit(cache=True, nogil=True)
@@ -122,27 +108,18 @@ def _first_capsule_hit(T, vertices, ends, radii):
                 for j in range(3):
                     p[i] += T[n, i, j] * vertices[v, j]
             for c in range(radii.shape[0]):
-                if _squared_distance(p, ends[n, c, 0], ends[n, c, 1]) < radii[c] ** 2:
+                if squared_distance(p, ends[n, c, 0], ends[n, c, 1]) < radii[c] ** 2:
                     return c
     return -1
 
 
 @njit(cache=True, nogil=True)
 def _first_capsule_pair(ends, radii, pairs):
-    """Return the first two capsules of `pairs` that overlap at any pose, or (−1, −1).
-
-    The shorter way to two segments' distance: one is walked in 6 mm steps, which its radius covers.
-    """
-    p = np.empty(3)
+    """Return the first two capsules of `pairs` that overlap at any pose, or (−1, −1)."""
     for n in range(ends.shape[0]):
         for k in range(pairs.shape[0]):
             one, other = pairs[k, 0], pairs[k, 1]
-            a, b = ends[n, one, 0], ends[n, one, 1]
-            steps = int(np.sqrt((b[0] - a[0]) ** 2 + (b[1] - a[1]) ** 2 + (b[2] - a[2]) ** 2) / 0.006) + 1
-            for s in range(steps + 1):
-                for i in range(3):
-                    p[i] = a[i] + (b[i] - a[i]) * s / steps
-                reach = radii[one] + radii[other]
-                if _squared_distance(p, ends[n, other, 0], ends[n, other, 1]) < reach**2:
-                    return one, other
+            gap = segment_distance(ends[n, one, 0], ends[n, one, 1], ends[n, other, 0], ends[n, other, 1])
+            if gap < radii[one] + radii[other]:
+                return one, other
     return -1, -1

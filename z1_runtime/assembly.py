@@ -47,6 +47,7 @@ def _yolo_config(config: RuntimeConfig) -> YoloConfig:
         weights=Path(config.detector_weights) if config.detector_weights else None,
         runtime=config.detector_runtime,
         min_confidence=config.detector_confidence,
+        mirrored=config.detector_mirrored,
     )
 
 

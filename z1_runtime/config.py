@@ -37,6 +37,8 @@ class RuntimeConfig:
     """What runs `yolo`: `openvino`, `onnxruntime`, `torch`, or `auto`, the first of these that is installed."""
     detector_confidence: float = 0.5
     """What `yolo` is not surer of than this does not count, in [0, 1)."""
+    detector_mirrored: bool = True
+    """Whether `yolo` looks at the mirror image as well: fewer errors for twice the time."""
     object_class: str = ""
     """The class to pick, for a detector that knows classes; empty = whatever it is surest of."""
     generator: str = "diffusion"

@@ -85,9 +85,8 @@ def iou(a, b):
 @pytest.mark.parametrize("shape", [SIZE, (300, 500), (500, 200), (97, 131)])
 def test_boxes_and_masks_are_those_of_ultralytics(ours, checkpoint, shape):
     image = picture(*shape)
-    detector = YoloDetector(
-        YoloConfig(weights=ours, runtime="onnxruntime", min_confidence=0.4, max_iou=0.6, max_detections=100)
-    )
+    options = {"min_confidence": 0.4, "max_iou": 0.6, "max_detections": 100, "mirrored": False}
+    detector = YoloDetector(YoloConfig(weights=ours, runtime="onnxruntime", **options))
     found = detector.detect(image)
     labels, confidences, boxes, masks = predict(checkpoint, image, SIZE, conf=0.4, iou=0.6, max_det=100)
     assert len(found) > 10
@@ -103,12 +102,40 @@ def test_a_network_without_masks_gives_boxes_alone(tmp_path):
     path = tmp_path / "boxes.pt"
     save_checkpoint(path, detecting(), ("bottle", "cup", "dog"), "detect")
     image = picture(480, 640)
-    found = YoloDetector(YoloConfig(weights=path, runtime="onnxruntime", max_detections=100)).detect(image)
+    config = YoloConfig(weights=path, runtime="onnxruntime", max_detections=100, mirrored=False)
+    found = YoloDetector(config).detect(image)
     labels, confidences, boxes, masks = predict(path, image, (480, 640), conf=0.5, iou=0.7, max_det=100)
     assert masks is None
     assert len(found) > 5
     matched(found, labels, confidences, boxes)
     assert all(d.mask is None for d in found)
+
+
+def test_what_is_seen_in_the_mirror_is_the_mirror_image_of_what_is_seen(ours):
+    """By itself the network is not so even-handed: asked once, it sees other things in the mirror."""
+    image = picture(*SIZE)
+    misses = {}
+    for mirrored in (True, False):
+        detector = YoloDetector(YoloConfig(weights=ours, runtime="onnxruntime", mirrored=mirrored, max_detections=100))
+        seen, in_mirror = detector.detect(image), detector.detect(np.ascontiguousarray(image[:, ::-1]))
+        assert len(seen) > 5
+        misses[mirrored] = sum(not any(mirror_images(a, b) for b in in_mirror) for a in seen)
+    assert misses[True] == 0 < misses[False]
+
+
+def mirror_images(a, b):
+    left, top, right, bottom = b.box_px
+    close = np.abs(np.subtract(a.box_px, (SIZE[1] - right, top, SIZE[1] - left, bottom))).max() <= 1
+    return a.label == b.label and abs(a.confidence - b.confidence) < 1e-4 and close
+
+
+def test_a_network_with_other_anchors_looks_once(ours, monkeypatch):
+    monkeypatch.setattr("models.detector.n_anchors", lambda _: -1)
+    other, once = (
+        YoloDetector(YoloConfig(weights=ours, runtime="onnxruntime", mirrored=mirrored)) for mirrored in (True, False)
+    )
+    boxes = [[d.box_px for d in detector.detect(picture(*SIZE))] for detector in (other, once)]
+    assert boxes[0] == boxes[1]
 
 
 @pytest.mark.parametrize("runtime", RUNTIMES)
