@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import cv2
@@ -22,6 +22,7 @@ from z1_runtime.cloud import (
     transform,
     valid_pixels,
 )
+from z1_runtime.depth_check import lies_flat, trimmed
 from z1_runtime.table import TableConfig, expected_table, fit_table
 
 _BORDER_PX = 3  # stereo matches windows, not pixels: the outermost ones stay unmeasured
@@ -187,36 +188,14 @@ class YoloDetector:
         self.runtime = self._detector.runtime
 
     def detect(self, frame: RgbdFrame, T_base_camera: np.ndarray) -> list[Detection]:
-        """Return the objects in the colour image, also the faint ones; see `Detector.detect`."""
-        del T_base_camera  # colour alone
+        """Return the objects in the colour image, also the faint ones, but none that is flat; see `Detector.detect`."""
+        del T_base_camera
         found = self._detector.detect(frame.colour, min(_FAINT, self.min_confidence))
-        return [_held_against_depth(detection, frame.depth_m) for detection in found]
+        return [trimmed(d, frame.depth_m) for d in found if not lies_flat(d, frame.depth_m)]
 
 
 _FAINT = 0.1
 """Confidence from which on something is worth a word when nothing better was seen."""
-_EDGE_PX = 4
-"""Masks are a few pixels off at their edge, where what is behind begins."""
-_EDGE_M = 0.010
-"""An edge pixel this much nearer or farther than all inner ones is not of the object [m]."""
-
-
-def _held_against_depth(detection: Detection, depth_m: np.ndarray) -> Detection:
-    """Return `detection` without the pixels at its mask's edge that were measured in front of or behind the object.
-
-    Pixels without depth stay, as in the tabletop's masks: holes belong to what is around them.
-    """
-    mask = detection.mask
-    if mask is None:
-        return detection
-    grown = np.ones((2 * _EDGE_PX + 1,) * 2, np.uint8)
-    inner = cv2.erode(mask.astype(np.uint8), grown, borderType=cv2.BORDER_CONSTANT, borderValue=1).astype(bool)
-    depths = depth_m[inner & (depth_m > 0)]
-    if not len(depths):
-        return detection  # too thin to have an inside
-    nearest, farthest = np.percentile(depths, [1.0, 99.0])
-    outside = (depth_m > 0) & ((depth_m < nearest - _EDGE_M) | (depth_m > farthest + _EDGE_M))
-    return replace(detection, mask=mask & (inner | ~outside))
 
 
 _DETECTORS: dict[str, Callable[[YoloConfig], Detector]] = {
