@@ -14,6 +14,7 @@ from hal.clock import Stopwatch
 from hal.messages import Intrinsics, RgbdFrame
 from models.mvbb import RankedGrasps, fit_obb, rank_grasps
 from models.types import GraspGenerator, GraspSet
+from z1_runtime import mount_sight
 from z1_runtime.config import RuntimeConfig
 from z1_runtime.detectors import TruthDetector
 from z1_runtime.kinematics import Kinematics
@@ -187,6 +188,8 @@ class Decider:
 
     def warm_up(self) -> None:
         """Decide once on a drawn scene, so that the first real frame does not wait for compilers and caches."""
+        if self.config.perception.mount.enabled:
+            mount_sight.warm_up()  # no jaws are in the drawn scene
         q = np.append(z1.Q_HOME, self.config.jaw_home)
         T_base_camera = self.kinematics.flange(z1.Q_HOME) @ self.T_flange_camera
         frame = draw_can(T_base_camera)

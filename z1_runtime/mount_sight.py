@@ -129,6 +129,11 @@ class SeenMount:
     """Root mean square distance of those from the meshes [m]."""
 
 
+def warm_up() -> None:
+    """Read and sample the meshes, so that the first look is as fast as the next."""
+    _jaws(z1.GRIPPER_CLOSED)
+
+
 def _step(at: np.ndarray, normals: np.ndarray, offsets: np.ndarray) -> np.ndarray:
     """Return the small motion (4, 4) of points (N, 3) that brings them closest to planes `offsets` (N,) below them."""
     weights = 1.0 / (1.0 + (offsets / _SOFT_M) ** 2)

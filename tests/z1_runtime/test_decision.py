@@ -12,6 +12,7 @@ from hal import z1
 from models.mvbb import fit_obb, rank_grasps
 from models.obb import DegenerateCloudError
 from models.types import GraspSet
+from z1_runtime import mount_sight
 from z1_runtime.assembly import make_decider
 from z1_runtime.cloud import transform
 from z1_runtime.config import RuntimeConfig
@@ -162,6 +163,12 @@ def test_warming_up_decides_without_a_camera_whichever_the_detector(detector, ca
     with caplog.at_level("INFO", "z1_runtime.decision"):
         make_decider(replace(RuntimeConfig(), detector=detector)).warm_up()
     assert not caplog.records
+
+
+def test_warming_up_reads_the_jaws_meshes_though_no_jaws_are_drawn(decider):
+    mount_sight._sampled.cache_clear()
+    decider.warm_up()
+    assert mount_sight._sampled.cache_info().currsize == 2
 
 
 def test_a_configuration_that_cannot_grasp_the_warm_up_scene_is_told_at_the_real_one(T_base_camera, caplog):
