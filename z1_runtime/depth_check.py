@@ -30,6 +30,10 @@ def trimmed(detection: Detection, depth_m: np.ndarray) -> Detection:
     """Return `detection` without the pixels at its mask's edge that were measured in front of or behind the object.
 
     Pixels without depth stay, as in the tabletop's masks: holes belong to what is around them.
+
+    Args:
+        detection: one without a mask stays as it is.
+        depth_m: (H, W), 0 where nothing was measured [m].
     """
     mask = detection.mask
     if mask is None:
@@ -47,6 +51,10 @@ def lies_flat(detection: Detection, depth_m: np.ndarray) -> bool:
     """Return whether what was detected lies in the plane of what is around it: a pattern or a shadow, not a thing.
 
     False where depth cannot tell: too little of it was measured, or the surroundings are no plane.
+
+    Args:
+        detection: with a mask, or its box stands for one.
+        depth_m: (H, W), 0 where nothing was measured [m].
     """
     mask = detection.mask if detection.mask is not None else box_pixels(depth_m.shape, detection.box_px)
     measured = depth_m > 0

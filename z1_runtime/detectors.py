@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Protocol
@@ -25,6 +26,7 @@ from z1_runtime.cloud import (
 from z1_runtime.depth_check import lies_flat, trimmed
 from z1_runtime.table import TableConfig, expected_table, fit_table
 
+_LOG = logging.getLogger(__name__)
 _BORDER_PX = 3  # stereo matches windows, not pixels: the outermost ones stay unmeasured
 
 
@@ -191,7 +193,18 @@ class YoloDetector:
         """Return the objects in the colour image, also the faint ones, but none that is flat; see `Detector.detect`."""
         del T_base_camera
         found = self._detector.detect(frame.colour, min(_FAINT, self.min_confidence))
-        return [trimmed(d, frame.depth_m) for d in found if not lies_flat(d, frame.depth_m)]
+        return [trimmed(d, frame.depth_m) for d in found if not self._is_flat(d, frame.depth_m)]
+
+    def _is_flat(self, detection: Detection, depth_m: np.ndarray) -> bool:
+        flat = lies_flat(detection, depth_m)
+        if flat and detection.confidence > self.min_confidence:
+            _LOG.warning(
+                "what looks like a %s (confidence %.2f) lies in the plane around it, so it is taken for a pattern; if "
+                "it is a thing, look from lower down, or use --detector tabletop.",
+                detection.label,
+                detection.confidence,
+            )
+        return flat
 
 
 _FAINT = 0.1

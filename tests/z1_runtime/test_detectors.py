@@ -196,6 +196,18 @@ def test_a_mask_without_an_inside_or_without_depth_stays_as_it_is(yolo):
     assert (found.mask == line).all()
 
 
+def test_a_pattern_on_the_table_is_not_reported_and_that_is_said(yolo, caplog):
+    pattern = np.zeros((480, 640), bool)
+    pattern[330:410, 420:540] = True
+    frame = noisy_frame([BOTTLE])
+    yolo._detector.seen = [
+        Detection(label="bottle", confidence=0.9, box_px=mask_box(mask), mask=mask) for mask in (pattern, truth(frame))
+    ]
+    (found,) = yolo.detect(frame, T_base_camera())
+    assert iou(found.mask, truth(frame)) > 0.9
+    assert "what looks like a bottle (confidence 0.90) lies in the plane around it" in caplog.text
+
+
 def test_missing_weights_of_the_learned_detector_name_the_file_and_what_makes_it(tmp_path):
     with pytest.raises(
         WeightsError, match=r"mine\.npz is missing; restore it, .* Without weights: --detector tabletop"
