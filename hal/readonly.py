@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from hal.errors import CommandRefusedError, LeaseError
 from hal.servo import Servo
+from hal.servo_cycle import WatchingCycle
 
 _WHY = "this HAL only watches (--readonly) and commands nothing"
 
 
 class ReadonlyServo(Servo):
     """A servo whose ticks measure, publish, and no more. What the arm reports latches as usual, and is told."""
+
+    cycle_type = WatchingCycle
 
     def claim(self, owner: str) -> None:
         """Refuse.
@@ -28,7 +31,3 @@ class ReadonlyServo(Servo):
         raise CommandRefusedError(
             f"{_WHY}, so it cannot stop the arm ({reason}): stop whoever moves it, or use the switch on the arm."
         )
-
-    def _act(self, now_s: float) -> None:
-        """Command nothing: what the arm does is what it was told."""
-        self._q_sent = self._motion.q = self._state.q

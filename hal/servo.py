@@ -6,26 +6,22 @@ producers ask for waits in `hal.orders.Orders`, what the tick tells them is one 
 
 from __future__ import annotations
 
-import numpy as np
-
 from hal.arm import Arm
 from hal.clock import Clock
 from hal.errors import CommandRefusedError, HalError, HalTimeoutError, NotConnectedError
 from hal.guard import Guard
-from hal.limits import OverloadWatch, ServoLimits, clip_setpoint, find_blocked, servo_torque
+from hal.limits import ServoLimits, clip_setpoint
 from hal.messages import ArmSetpoint, ArmState, ServoHealth, ServoMode, ServoStatus, TrajectoryChunk
-from hal.motion import Motion, Wish
 from hal.orders import Orders, Snapshot
 from hal.periods import PeriodStatistics
-from hal.playback import Playback
+from hal.servo_cycle import Cycle
 from hal.servo_status import Teller, make_health, make_status
-from hal.z1 import N_ARM
 
 _STATE_MAX_AGE_S = 0.2
 
 
 class Servo:
-    """An arm that takes trajectories (`hal.arm.ServoedArm`).
+    """An arm that takes trajectories (`hal.arm.ServoedArm`). What a tick does is in `hal.servo_cycle`.
 
     Args:
         arm: what is moved.
@@ -38,6 +34,8 @@ class Servo:
         send_timeout_s: how long a single setpoint is followed [s].
         guard: keeps the arm above the table, in its workspace and off itself; None leaves the joint limits alone.
     """
+
+    cycle_type: type[Cycle] = Cycle
 
     def __init__(
         self,
@@ -58,13 +56,9 @@ class Servo:
         """What the thread that ticks was granted, for `health`."""
         self._heartbeat_timeout_s = heartbeat_timeout_s
         self._send_timeout_s = send_timeout_s
-        self._guard = guard
         self._orders = Orders(self.limits, None if heartbeat_timeout_s is None else lease_timeout_s, guard)
-        # Written by the tick.
-        self._snapshot: Snapshot | None = None
+        self._snapshot: Snapshot | None = None  # replaced by the tick
         self._ticked = False
-        self._clips = 0
-        self._teller = Teller()
 
     # --- Life -----------------------------------------------------------------------------------------------
 
@@ -83,24 +77,26 @@ class Servo:
             self.arm.disconnect()
             raise
         self._orders.reset()
-        self._reset(state)
+        self._teller, self._ticked = Teller(), False
+        self._cycle = self.cycle_type(
+            self.arm,
+            self.limits,
+            self._orders,
+            state,
+            heartbeat_timeout_s=self._heartbeat_timeout_s,
+            send_timeout_s=self._send_timeout_s,
+        )
+        self._snapshot = self._cycle.snapshot(self.clock.now_s())
 
     def keep_inside(self, guard: Guard) -> None:
         """Let `guard` check whatever is commanded from now on; for before anything ticks."""
-        self._guard = self._orders.guard = guard
+        self._orders.guard = guard
 
     def disconnect(self) -> None:
         """Let go of the arm, which holds where it is. Brake first (`stop`) if it moves; end a `ServoThread` first."""
         self._snapshot = None
         self._orders.lease.clear()
         self.arm.disconnect()
-
-    def _reset(self, state: ArmState) -> None:
-        self._motion = Motion(self.limits, state.q)
-        self._overload = OverloadWatch(self.limits)
-        self._state, self._q_sent = state, state.q
-        self._link_lost = self._give_way = self._gave_way = self._ticked = False
-        self._publish(self.clock.now_s())
 
     def _connected(self) -> Snapshot:
         snapshot = self._snapshot
@@ -206,7 +202,7 @@ class Servo:
         """Return the servo's account of its last tick; built on request, so that the tick need not."""
         snapshot = self._connected()
         now_s = self.clock.now_s()
-        self._teller.tell(self._orders.latch, self._clips + self._orders.beyond, now_s)
+        self._teller.tell(self._orders.latch, self._cycle.clips + self._orders.beyond, now_s)
         return make_status(snapshot, self._orders, self.periods, now_s)
 
     def health(self) -> ServoHealth:
@@ -216,7 +212,7 @@ class Servo:
     # --- The tick -----------------------------------------------------------------------------------------------
 
     def tick(self) -> None:
-        """One cycle: measure, choose the setpoint, limit it, send it. Never blocks and never logs.
+        """Run one cycle (`hal.servo_cycle`). Never blocks and never logs.
 
         Trajectory time moves on by exactly one control period a call, however late the call is.
 
@@ -227,127 +223,4 @@ class Servo:
         self._ticked = True
         now_s = self.clock.now_s()
         self.periods.record(now_s)
-        self._measure()
-        self._act(now_s)
-        self._publish(now_s)
-
-    def _act(self, now_s: float) -> None:
-        """Command the arm for this cycle."""
-        self._command(*self._choose(now_s))
-
-    def _measure(self) -> None:
-        try:
-            state = self.arm.read_state()
-        except HalError as error:
-            self._fault(f"the arm's state is lost: {error}")
-            return
-        self._state = state
-        if state.faults:
-            self._fault(f"the arm reports {', '.join(state.faults)}")
-            return
-        overload = self._overload.update(state.tau, servo_torque(self._q_sent, state.q))
-        blocked = overload or find_blocked(self.limits, self._q_sent, state.q)
-        if blocked:
-            # Holding the command would go on pushing: once at rest, the arm holds what it measures instead. Only
-            # once until it is re-armed, lest a load that does not end pull it along.
-            if not self._gave_way:
-                self._give_way = self._gave_way = True
-            self._fault(blocked)
-
-    def _fault(self, reason: str) -> None:
-        """Latch, as `stop` does: somebody has to look at the arm before it moves again."""
-        orders = self._orders
-        if not orders.latch:
-            orders.cancel_reason = reason
-            orders.latch = reason
-
-    def _choose(self, now_s: float) -> Wish:
-        motion, orders = self._motion, self._orders
-        if orders.rearmed:
-            orders.rearmed = self._link_lost = self._gave_way = False
-            self._give_way, motion.reason = True, ""
-        if orders.done_id > motion.trajectory_id:
-            motion.skip(orders.done_id, orders.cancel_reason)
-        # Read once: a producer may replace any of them while this runs.
-        newest, current, target = orders.playback, orders.current, orders.target
-        if orders.latch:
-            orders.finish(newest)
-            orders.target = None
-            if motion.mode is ServoMode.TRACKING:
-                motion.brake(orders.latch, newest)
-        elif current is not None:
-            return self._follow(current, now_s)
-        elif target is not None and now_s - target.stamp_s <= self._send_timeout_s:
-            return self._chase(target.setpoint.q)
-        elif motion.mode is ServoMode.TRACKING:
-            motion.brake("" if target else orders.cancel_reason, newest)
-            orders.target = None
-        if self._give_way and motion.mode is ServoMode.HOLDING:
-            self._give_way = False
-            motion.give_way(self._state.q)
-        return motion.rest()
-
-    def _follow(self, current: Playback, now_s: float) -> Wish:
-        motion = self._motion
-        if current.trajectory_id != motion.trajectory_id:
-            motion.begin(current)
-        orders = self._orders
-        why = self._lateness(now_s) or orders.dead_end.get(current.trajectory_id, "")
-        if why or motion.runs_dry(current):
-            orders.finish(current)
-            motion.brake(why or f"trajectory {current.trajectory_id} ran dry at {current.end_s:.3f} s", current)
-            return motion.rest()
-        wish = motion.play(current)
-        if motion.finished:
-            self._orders.finish(current)
-        return wish
-
-    def _chase(self, q_target: np.ndarray) -> Wish:
-        """Move towards a setpoint; brake where going on could no longer be stopped inside the guard's space."""
-        motion = self._motion
-        wish = motion.chase(q_target)
-        if self._guard is not None:
-            ahead = np.array([wish[0], motion.find_rest()])
-            if refusal := self._guard.refusal(ahead, self._q_sent):
-                self._orders.target = None
-                motion.brake(f"the way to the setpoint {refusal[1]}")
-                return motion.rest()
-        return wish
-
-    def _lateness(self, now_s: float) -> str:
-        lease, allowed_s = self._orders.lease, self._heartbeat_timeout_s
-        silent_s = now_s - lease.beat_s
-        if allowed_s is None or silent_s <= allowed_s:
-            return ""
-        return f"no heartbeat from {lease.owner!r} for {silent_s:.3f} s (allowed {allowed_s} s)"
-
-    def _command(self, q: np.ndarray, dq: np.ndarray) -> None:
-        state = self._state
-        allowed = clip_setpoint(self.limits, q, dq, q_last=self._q_sent, q_measured=state.q, dq_measured=state.dq)
-        self._clips += allowed.clipped
-        noted = np.minimum(np.maximum(q, self.limits.q_min), self.limits.q_max)
-        noted[:N_ARM] = allowed.q[:N_ARM]
-        self._motion.take_note(noted, np.append(allowed.dq[:N_ARM], dq[N_ARM]))
-        if self._link_lost:
-            return
-        try:
-            self._q_sent = self.arm.send(ArmSetpoint(q=allowed.q, dq=allowed.dq)).q
-        except HalError as error:
-            self._fault(f"the arm takes no commands: {error}")
-            self._link_lost = True
-
-    def _publish(self, now_s: float) -> None:
-        motion = self._motion
-        # A stop may come in the middle of a tick: what still tracks is not stopped yet.
-        stopped = bool(self._orders.latch) and motion.mode is ServoMode.HOLDING
-        self._snapshot = Snapshot(
-            stamp_s=now_s,
-            mode=ServoMode.STOPPED if stopped else motion.mode,
-            reason=self._orders.latch or motion.reason,
-            trajectory_id=motion.trajectory_id,
-            time_s=max(motion.time_s, 0.0),
-            finished=motion.finished,
-            q_sent=self._q_sent,
-            q_wanted=motion.q,
-            state=self._state,
-        )
+        self._snapshot = self._cycle.run(now_s)
