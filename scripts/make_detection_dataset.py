@@ -27,15 +27,18 @@ from sim_twin.detection_scenes import Label, Picture, SceneMix
 SPLITS = {"train": 1_000_000, "val": 2_000_000, "empty": 3_000_000}
 """Name to the first seed: no two splits share a seed, so neither props, textures nor lights."""
 
-_CHANGES = {"train": {"crowd": 0.75, "empty": 0.05, "twin": 0.25, "own": 0.35}, "empty": {"empty": 1.0}}
-"""In what the splits differ from the mix."""
+_CHANGES = {
+    "train": {"crowd": 0.5, "empty": 0.1, "twin": 0.25, "own": 0.35, "distractors": 6.0},
+    "empty": {"empty": 1.0},
+}
+"""In what the splits differ from the mix: a training picture holds more of all that can be mistaken."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Config:
     """How many pictures, and of what."""
 
-    train: int = 8000
+    train: int = 12000
     """Pictures to learn from."""
     val: int = 500
     """Held-out pictures."""

@@ -10,10 +10,12 @@ Checkpoints and logs lie in out/detector/run. Phases at growing picture sizes, s
 from __future__ import annotations
 
 import json
+import multiprocessing
 import os
 import tempfile
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from threading import Thread
 
 import tyro
 
@@ -74,6 +76,7 @@ def _train_together(config: Config) -> None:
 def _train_as_peer(rank: int, config: Config, rendezvous: str) -> None:
     ranks = {"RANK": str(rank), "LOCAL_RANK": str(rank), "WORLD_SIZE": str(config.processes)}
     os.environ |= ranks  # ultralytics reads them when it is imported, and deals the pictures out by them
+    end_with_parent()
     from torch import distributed
 
     distributed.init_process_group("gloo", init_method=rendezvous, rank=rank, world_size=config.processes)
@@ -81,9 +84,21 @@ def _train_as_peer(rank: int, config: Config, rendezvous: str) -> None:
     distributed.destroy_process_group()
 
 
+def end_with_parent() -> None:
+    """End this process when the one that started it is gone, even if that was killed."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def wait() -> None:
+        parent.join()
+        os._exit(1)
+
+    Thread(target=wait, daemon=True).start()
+
+
 def write_weights(config: Config, checkpoint: Path) -> None:
     """Write the weights of `checkpoint`, their checksum and the recipe."""
-    from models.detector_training import ARCHITECTURE, AUGMENTATION, PHASES, read_checkpoint
+    from models.detector_training import ARCHITECTURE, AUGMENTATION, GAINS, PHASES, read_checkpoint
     from models.detector_weights import save_detector
 
     digest = save_detector(config.weights, read_checkpoint(checkpoint), CLASSES)
@@ -93,7 +108,8 @@ def write_weights(config: Config, checkpoint: Path) -> None:
         "processes": config.processes,
         "phases": [asdict(phase) for phase in PHASES],
     }
-    recipe |= {"augmentation": AUGMENTATION, "data": json.loads((config.data / "recipe.json").read_text())}
+    recipe |= {"augmentation": AUGMENTATION, "gains": GAINS}
+    recipe |= {"data": json.loads((config.data / "recipe.json").read_text())}
     recipe |= {"losses": _read_losses(config.run), "versions": _versions()}
     config.weights.with_suffix(".recipe.json").write_text(json.dumps(recipe, indent=1) + "\n")
     print(f"wrote {config.weights} ({config.weights.stat().st_size / 1e6:.1f} MB, SHA-256 {digest[:12]}…)")

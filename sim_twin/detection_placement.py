@@ -197,14 +197,26 @@ def _is_end_on(actor: Actor, pose: np.ndarray, lens: np.ndarray) -> bool:
 
 
 def place_distractors(
-    stage: Stage, places: list[np.ndarray], T_base_camera: np.ndarray, centre: np.ndarray, rng: np.random.Generator
+    stage: Stage,
+    places: list[np.ndarray],
+    T_base_camera: np.ndarray,
+    *,
+    centre: np.ndarray,
+    number: float,
+    crowd: bool,
+    rng: np.random.Generator,
 ) -> None:
-    """Put up to seven things of no class around `centre` (3,), apart from the objects at `places` and from the lens."""
+    """Put things of no class, `number` in the mean, apart from the objects at `places` and from the lens.
+
+    They stand around `centre` (3,), or in a crowd wherever the camera looks.
+    """
     others = stage.distractors()
-    for number in rng.permutation(len(others))[: min(rng.poisson(2.0), 7)]:
-        actor = others[number]
+    for actor in (others[k] for k in rng.permutation(len(others))[: rng.poisson(number)]):
         for _ in range(_TRIES):
-            xy = centre[:2] + rng.normal(0.0, 0.18, 2)
+            around = _look_at(stage, T_base_camera, rng) if crowd else centre
+            if around is None:
+                continue
+            xy = around[:2] + rng.normal(0.0, 0.05 if crowd else 0.18, 2)
             pose = _standing_at(actor, xy, _random_lean(rng))
             apart = all(np.linalg.norm(pose[:2, 3] - place[:2, 3]) > 0.09 for place in places)
             if apart and np.linalg.norm(pose[:3, 3] - T_base_camera[:3, 3]) > 0.16 and abs(pose[1, 3]) < 0.57:

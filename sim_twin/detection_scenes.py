@@ -81,7 +81,9 @@ class SceneMix:
     occluded: float = 0.2
     """Something put in front of the first object on purpose."""
     crowd: float = 0.0
-    """Up to eight objects instead of one to three: more to learn from a picture."""
+    """Up to eight objects instead of one to three: more to learn from a picture; what is none is then spread, too."""
+    distractors: float = 2.0
+    """Things of no class in a picture, in the mean; fewer where they do not fit."""
 
 
 def draw_scene(stage: Stage, rng: np.random.Generator, mix: SceneMix | None = None) -> Picture:
@@ -103,7 +105,9 @@ def draw_scene(stage: Stage, rng: np.random.Generator, mix: SceneMix | None = No
     places = place_objects(
         stage, objects, T_base_camera, centre=centre, by_wrist=by_wrist, crowd=crowd, end_on=end_on, rng=rng
     )
-    place_distractors(stage, places, T_base_camera, centre, rng)
+    place_distractors(
+        stage, places, T_base_camera, centre=centre, number=mix.distractors, crowd=mix.crowd > 0.0, rng=rng
+    )
     if places and rng.random() < mix.occluded:
         place_occluder(stage, places[0], T_base_camera, rng)
     _dress(stage, look, objects, rng)

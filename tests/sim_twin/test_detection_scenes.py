@@ -223,6 +223,21 @@ def test_a_crowd_shows_more_objects(stage: Stage) -> None:
 
 
 @needs_egl
+def test_more_of_what_is_no_object_stands_about_when_asked(stage: Stage) -> None:
+    def shown(distractors: float) -> int:
+        mix = SceneMix(crowd=0.5, occluded=0.0, distractors=distractors)
+        counts = []
+        for n in range(8):
+            draw_scene(stage, np.random.default_rng([6, n]), mix)
+            counts.append(sum(stage.shows(actor) for actor in stage.distractors()))
+        return sum(counts)
+
+    none, some, many = shown(0.0), shown(2.0), shown(6.0)
+    assert none == 0
+    assert 0 < some < many
+
+
+@needs_egl
 def test_every_mug_shows_its_handle(stage: Stage) -> None:
     """Without it a mug is a cylinder, which a picture must not show without a label."""
     seen = 0
