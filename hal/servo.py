@@ -36,6 +36,7 @@ class Servo:
     """
 
     cycle_type: type[Cycle] = Cycle
+    """What a tick does."""
 
     def __init__(
         self,
