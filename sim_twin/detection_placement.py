@@ -203,20 +203,20 @@ def place_distractors(
     *,
     centre: np.ndarray,
     number: float,
-    crowd: bool,
+    spread: bool,
     rng: np.random.Generator,
 ) -> None:
     """Put things of no class, `number` in the mean, apart from the objects at `places` and from the lens.
 
-    They stand around `centre` (3,), or in a crowd wherever the camera looks.
+    They stand around `centre` (3,), or, if `spread`, wherever the camera looks.
     """
     others = stage.distractors()
     for actor in (others[k] for k in rng.permutation(len(others))[: rng.poisson(number)]):
         for _ in range(_TRIES):
-            around = _look_at(stage, T_base_camera, rng) if crowd else centre
+            around = _look_at(stage, T_base_camera, rng) if spread else centre
             if around is None:
                 continue
-            xy = around[:2] + rng.normal(0.0, 0.05 if crowd else 0.18, 2)
+            xy = around[:2] + rng.normal(0.0, 0.05 if spread else 0.18, 2)
             pose = _standing_at(actor, xy, _random_lean(rng))
             apart = all(np.linalg.norm(pose[:2, 3] - place[:2, 3]) > 0.09 for place in places)
             if apart and np.linalg.norm(pose[:3, 3] - T_base_camera[:3, 3]) > 0.16 and abs(pose[1, 3]) < 0.57:

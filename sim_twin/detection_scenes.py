@@ -106,7 +106,7 @@ def draw_scene(stage: Stage, rng: np.random.Generator, mix: SceneMix | None = No
         stage, objects, T_base_camera, centre=centre, by_wrist=by_wrist, crowd=crowd, end_on=end_on, rng=rng
     )
     place_distractors(
-        stage, places, T_base_camera, centre=centre, number=mix.distractors, crowd=mix.crowd > 0.0, rng=rng
+        stage, places, T_base_camera, centre=centre, number=mix.distractors, spread=mix.crowd > 0.0, rng=rng
     )
     if places and rng.random() < mix.occluded:
         place_occluder(stage, places[0], T_base_camera, rng)
