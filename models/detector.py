@@ -30,6 +30,9 @@ class YoloConfig:
     """Of two boxes of a class that overlap more, the less confident is dropped (ultralytics' own value)."""
     max_detections: int = 20
     """Most objects of an image."""
+    every_class: bool = False
+    """Each class that may be at a place counts as a detection of its own, as mean average precision is reckoned; else
+    the likeliest alone."""
     mirrored: bool = True
     """It looks at the mirror image as well and takes the mean of both: fewer errors for twice the time (figures in
     `models/weights/README.md`). Networks whose anchors do not lie as YOLOv8's do look once."""
@@ -84,6 +87,7 @@ class YoloDetector:
             min_confidence=self.config.min_confidence if min_confidence is None else min_confidence,
             max_iou=self.config.max_iou,
             max_detections=self.config.max_detections,
+            every_class=self.config.every_class,
         )
 
 

@@ -77,6 +77,7 @@ def read_outputs(
     min_confidence: float,
     max_iou: float,
     max_detections: int,
+    every_class: bool = False,
 ) -> list[Detection]:
     """Return what the network's outputs say, most confident first.
 
@@ -89,11 +90,15 @@ def read_outputs(
         min_confidence: what is not above this is dropped.
         max_iou: of two boxes of a class that overlap more than this, the less confident is dropped.
         max_detections: at most so many are returned.
+        every_class: each class of an anchor is a detection of its own, not its likeliest alone.
     """
-    kept = _suppressed(rows, len(names), min_confidence, max_iou)[:max_detections]
-    boxes = letterbox.to_image(_corners(rows[:4, kept].T))
+    scores = rows[4 : 4 + len(names)]
+    classes, anchors = _candidates(scores, min_confidence, every_class)
+    corners = _corners(rows[:4, anchors].T)
+    kept = _suppressed(corners, scores[classes, anchors], classes, max_iou)[:max_detections]
+    boxes = letterbox.to_image(corners[kept])
     found = []
-    for anchor, box in zip(kept, boxes, strict=True):
+    for number, anchor, box in zip(classes[kept], anchors[kept], boxes, strict=True):
         mask = None
         if prototypes is not None:
             weights = rows[4 + len(names) :, anchor]
@@ -101,9 +106,8 @@ def read_outputs(
         edges = _whole_pixels(box)
         if edges[0] >= edges[2] or edges[1] >= edges[3] or (mask is not None and not mask.any()):
             continue  # outside of the image, or nothing of it to be seen
-        scores = rows[4 : 4 + len(names), anchor]
-        label, confidence = names[int(scores.argmax())], float(scores.max())
-        found.append(Detection(label=label, confidence=confidence, box_px=edges, mask=mask))
+        confidence = float(scores[number, anchor])
+        found.append(Detection(label=names[number], confidence=confidence, box_px=edges, mask=mask))
     return found
 
 
@@ -138,19 +142,21 @@ def mean_of_mirrored(rows: np.ndarray, mirrored: np.ndarray, n_classes: int, inp
     return mean
 
 
-def _suppressed(rows: np.ndarray, n_classes: int, min_confidence: float, max_iou: float) -> np.ndarray:
-    """Return the anchors that survive within their class, most confident first."""
-    scores = rows[4 : 4 + n_classes]
-    best = scores.max(axis=0)
-    candidates = np.flatnonzero(best > min_confidence)
-    candidates = candidates[np.argsort(-best[candidates], kind="stable")][:_MAX_CANDIDATES]
-    if not len(candidates):
-        return candidates
-    corners = _corners(rows[:4, candidates].T)
+def _candidates(scores: np.ndarray, min_confidence: float, every_class: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Return the classes and the anchors whose `scores` (C, A) are high enough, most confident first."""
+    anchors = np.flatnonzero(scores.max(axis=0) > min_confidence)
+    classes = scores[:, anchors].argmax(axis=0)
+    if every_class:
+        classes, anchors = np.nonzero(scores > min_confidence)
+    order = np.argsort(-scores[classes, anchors], kind="stable")[:_MAX_CANDIDATES]
+    return classes[order], anchors[order]
+
+
+def _suppressed(corners: np.ndarray, scores: np.ndarray, classes: np.ndarray, max_iou: float) -> np.ndarray:
+    """Return which of the boxes `corners` (N, 4) survive within their class, most confident first."""
     boxes = np.concatenate([corners[:, :2], corners[:, 2:] - corners[:, :2]], axis=1)
-    classes = scores[:, candidates].argmax(axis=0)
-    kept = cv2.dnn.NMSBoxesBatched(boxes.tolist(), best[candidates].tolist(), classes.tolist(), min_confidence, max_iou)
-    return candidates[np.sort(np.asarray(kept, dtype=int).reshape(-1))]
+    kept = cv2.dnn.NMSBoxesBatched(boxes.tolist(), scores.tolist(), classes.tolist(), 0.0, max_iou) if len(boxes) else ()
+    return np.sort(np.asarray(kept, dtype=int).reshape(-1))
 
 
 def _corners(boxes: np.ndarray) -> np.ndarray:

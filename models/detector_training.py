@@ -29,15 +29,18 @@ class Phase:
     """Share of `lr0` at the end; a straight line between, in steps of one batch."""
     warmup_epochs: float
     batch: int = 16
+    fraction: int | float = 12_000
+    """How many pictures, the first of those that are there; or which share of them."""
 
 
 PHASES = (
     Phase(imgsz=192, epochs=12, lr0=2.0e-3, lrf=0.8, warmup_epochs=1.0),
     Phase(imgsz=256, epochs=9, lr0=1.6e-3, lrf=0.75, warmup_epochs=0.2),
     Phase(imgsz=320, epochs=11, lr0=1.2e-3, lrf=0.02, warmup_epochs=0.2),
+    Phase(imgsz=320, epochs=2, lr0=6.0e-4, lrf=0.02, warmup_epochs=0.1, fraction=1.0),
 )
 """Small pictures teach most of it at a fraction of the time; the last have the size at which the network is used. The
-learning rate falls all the way."""
+learning rate falls all the way, and once more over the last passes, for which there are more pictures."""
 
 AUGMENTATION = {
     "hsv_h": 0.03,

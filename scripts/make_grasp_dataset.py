@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -47,6 +47,8 @@ class Config:
     """Labels of each shape that are tried in dynamics; none for the beak, whose jaws are not modelled there."""
     seed: int = 1000
     """Seed of the first shard; shard k takes seed + k."""
+    view: ViewConfig = field(default_factory=ViewConfig)
+    """How the shapes lie and are seen."""
     out: Path = Path("out/graspgen")
     """Folder for the shards."""
 
@@ -58,7 +60,7 @@ def main(config: Config) -> None:
     for shard in track(range(config.shards), description="shards"):
         path = folder / f"{config.seed + shard}.npz"
         if not path.exists():
-            save_shard(path, make_shard(gripper, config.seed + shard, config.shapes, config.views))
+            save_shard(path, make_shard(gripper, config.seed + shard, config.shapes, config.views, config.view))
         verdicts = path.with_suffix(".shaken.json")
         if config.shaken and isinstance(gripper, GripperSpec) and not verdicts.exists():
             with np.load(path, allow_pickle=False) as arrays:
@@ -87,7 +89,9 @@ def shake_shard(arrays: dict[str, np.ndarray], gripper: GripperSpec, count: int)
     return {"tried": dict(tried), "lost": dict(+lost)}
 
 
-def make_shard(gripper: Hand, seed: int, n_shapes: int, n_views: int) -> dict[str, np.ndarray]:
+def make_shard(
+    gripper: Hand, seed: int, n_shapes: int, n_views: int, view: ViewConfig | None = None
+) -> dict[str, np.ndarray]:
     """Return one shard's arrays; S shapes, V = S × views.
 
     `clouds` (V, 512, 6) points and normals in the view frame, `T_view_object` (V, 4, 4), `shape` (V,) index of the
@@ -103,7 +107,7 @@ def make_shard(gripper: Hand, seed: int, n_shapes: int, n_views: int) -> dict[st
         T, widths = find_grasps(solid, gripper, rng)
         if len(T) < _MIN_GRASPS:
             continue
-        views = draw_views(solid, ViewConfig(), n_views, rng)
+        views = draw_views(solid, view or ViewConfig(), n_views, rng)
         for cloud, T_view_object in views:
             rows["clouds"].append(cloud)
             rows["T_view_object"].append(T_view_object)

@@ -120,7 +120,8 @@ def _make_bottle(rng: np.random.Generator) -> tuple[Part, ...]:
     neck = rng.uniform(0.28, 0.48) * radius
     shoulder, collar = rng.uniform(0.58, 0.76), rng.uniform(0.82, 0.90)
     label = sorted(rng.uniform(0.15, 0.55, 2))
-    heights = [0.0, 0.02, label[0], max(label[1], label[0] + 0.05), shoulder, collar, rng.uniform(0.92, 0.95), 1.0]
+    end = min(max(label[1], label[0] + 0.05), shoulder - 0.005)
+    heights = [0.0, 0.02, label[0], end, shoulder, collar, rng.uniform(0.92, 0.95), 1.0]
     cap = neck * rng.uniform(1.0, 1.25)
     radii = [0.92 * radius, radius, radius, radius, radius, neck, neck, cap]
     profile = tuple((height * h, float(r)) for h, r in zip(heights, radii, strict=True))

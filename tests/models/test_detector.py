@@ -1,6 +1,7 @@
 """YOLOv8's pictures and numbers: as ultralytics' own predict() in every runtime, from every kind of file."""
 
 import sys
+from collections import Counter
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from detector_networks import detecting, picture, save_checkpoint, segmenting
 
 from models import detector_modules, detector_runtimes
 from models.detector import YoloConfig, YoloDetector, best_of, labels_for
+from models.detector_image import Letterbox
 from models.detector_runtimes import RUNTIMES, installed_runtimes, open_network
 from models.detector_weights import CLASSES, save_detector
 from models.types import Detection
@@ -96,6 +98,24 @@ def test_boxes_and_masks_are_those_of_ultralytics(ours, checkpoint, shape):
     if shape == SIZE:
         assert min(overlaps) > 0.95
     assert all(d.mask.shape == shape for d in found)
+
+
+def test_every_class_of_a_box_counts_as_in_ultralytics_validator(ours, checkpoint):
+    """An untrained network holds every class possible nearly everywhere."""
+    from ultralytics.utils.nms import non_max_suppression
+
+    image = picture(*SIZE)
+    network = open_network(ours, "onnxruntime")
+    rows, _ = network.run(Letterbox.fit(SIZE, SIZE).blob(image))
+    least = float(np.quantile(rows[4:7].min(axis=0), 0.5))
+    (wanted,) = non_max_suppression(torch.from_numpy(rows[None]), least, 0.7, multi_label=True, max_det=300, nc=3)
+    options = {"min_confidence": least, "max_detections": 300, "mirrored": False, "every_class": True}
+    found = YoloDetector(YoloConfig(weights=ours, runtime="onnxruntime", **options)).detect(image)
+    names = [network.names[int(number)] for number in wanted[:, 5]]
+    boxes = wanted[:, :4].numpy().clip(0, [SIZE[1], SIZE[0]] * 2)
+    matched(found, names, wanted[:, 4].numpy(), boxes)
+    at_one_place = Counter(d.box_px for d in found)
+    assert at_one_place.most_common(1)[0][1] > 1
 
 
 def test_a_network_without_masks_gives_boxes_alone(tmp_path):

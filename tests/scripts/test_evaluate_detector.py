@@ -59,8 +59,13 @@ def data(tmp_path: Path) -> Path:
     return tmp_path
 
 
+def measure(data: Path, spoil: Callable[[list[Detection]], list[Detection]]) -> dict[str, object]:
+    oracle = Oracle(data, spoil)
+    return measure_held_out(oracle, oracle, data, 500)  # pyright: ignore[reportArgumentType]
+
+
 def test_a_perfect_detector_has_full_marks(data: Path) -> None:
-    figures = measure_held_out(Oracle(data, lambda found: found), data, 500)  # pyright: ignore[reportArgumentType]
+    figures = measure(data, lambda found: found)
     assert figures["box_map50"] == pytest.approx(0.995, abs=0.001)  # 101 points between recalls 0 and 1
     assert figures["mask_map50_95"] == pytest.approx(0.995, abs=0.001)
     assert figures["precision"] == figures["recall"] == 1.0
@@ -74,10 +79,10 @@ def test_wrong_names_and_masks_that_miss_cost(data: Path) -> None:
     def thin(found: list[Detection]) -> list[Detection]:
         return [replace(d, mask=rectangle(*d.box_px[:2], d.box_px[0] + 60, d.box_px[3])) for d in found]
 
-    renamed = measure_held_out(Oracle(data, rename), data, 500)  # pyright: ignore[reportArgumentType]
+    renamed = measure(data, rename)
     assert float(str(renamed["box_map50"])) < 0.7
     assert renamed["box_map50_by_look"] == {"any": 0.995, "own": 0.0, "twin": 0.995}
-    thinned = measure_held_out(Oracle(data, thin), data, 500)  # pyright: ignore[reportArgumentType]
+    thinned = measure(data, thin)
     assert thinned["box_map50_95"] == pytest.approx(0.995, abs=0.001)
     assert float(str(thinned["mask_map50_95"])) < 0.4
 

@@ -191,6 +191,15 @@ def test_props_keep_the_proportions_that_tell_them_from_distractors() -> None:
     assert np.ptp(np.vstack(nominal_prop("bottle").corners()), axis=0)[2] == pytest.approx(0.200)
 
 
+def test_a_label_high_up_ends_below_the_shoulder() -> None:
+    class Extreme:
+        def uniform(self, low: float, high: float, size: int | None = None) -> float | np.ndarray:
+            return low if size is None else np.full(size, high)  # the label's two edges are drawn at once
+
+    bottle = make_class_prop("bottle", Extreme())  # pyright: ignore[reportArgumentType]
+    assert all(min(part.size_m) > 0.0 for part, _ in bottle.parts)
+
+
 def test_textures_are_pictures_and_come_from_their_seed() -> None:
     for seed in range(30):
         picture = random_texture(np.random.default_rng(seed), 64)
