@@ -26,8 +26,9 @@ class YoloConfig:
     """`openvino`, `onnxruntime` or `torch`; `auto` is the first of these that is installed."""
     min_confidence: float = 0.5
     """What is not above this is not seen, in [0, 1)."""
-    max_iou: float = 0.7
-    """Of two boxes of a class that overlap more, the less confident is dropped (ultralytics' own value)."""
+    max_iou: float = 0.5
+    """Of two boxes of a class that overlap more, the less confident is dropped. Ultralytics' own value, 0.7, leaves
+    second boxes of one object: box mAP50 0.972 for 0.974 on 300 pictures that are neither of training nor held out."""
     max_detections: int = 20
     """Most objects of an image."""
     every_class: bool = False

@@ -122,7 +122,7 @@ def test_a_network_without_masks_gives_boxes_alone(tmp_path):
     path = tmp_path / "boxes.pt"
     save_checkpoint(path, detecting(), ("bottle", "cup", "dog"), "detect")
     image = picture(480, 640)
-    config = YoloConfig(weights=path, runtime="onnxruntime", max_detections=100, mirrored=False)
+    config = YoloConfig(weights=path, runtime="onnxruntime", max_iou=0.7, max_detections=100, mirrored=False)
     found = YoloDetector(config).detect(image)
     labels, confidences, boxes, masks = predict(path, image, (480, 640), conf=0.5, iou=0.7, max_det=100)
     assert masks is None
