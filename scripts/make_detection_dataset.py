@@ -38,7 +38,7 @@ _CHANGES = {
 class Config:
     """How many pictures, and of what."""
 
-    train: int = 12000
+    train: int = 20000
     """Pictures to learn from."""
     val: int = 500
     """Held-out pictures."""

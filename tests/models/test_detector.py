@@ -109,7 +109,7 @@ def test_every_class_of_a_box_counts_as_in_ultralytics_validator(ours, checkpoin
     rows, _ = network.run(Letterbox.fit(SIZE, SIZE).blob(image))
     least = float(np.quantile(rows[4:7].min(axis=0), 0.5))
     (wanted,) = non_max_suppression(torch.from_numpy(rows[None]), least, 0.7, multi_label=True, max_det=300, nc=3)
-    options = {"min_confidence": least, "max_detections": 300, "mirrored": False, "every_class": True}
+    options = {"min_confidence": least, "max_iou": 0.7, "max_detections": 300, "mirrored": False, "every_class": True}
     found = YoloDetector(YoloConfig(weights=ours, runtime="onnxruntime", **options)).detect(image)
     names = [network.names[int(number)] for number in wanted[:, 5]]
     boxes = wanted[:, :4].numpy().clip(0, [SIZE[1], SIZE[0]] * 2)
