@@ -42,7 +42,7 @@ class Config:
     in the rows, or the one after a single one."""
     reading: Literal["top1", "fallthrough"] = "top1"
     """What counts as a success: the first-ranked grasp alone, or the first that the arm can do. A proposal must win in
-    this and not lose in the other."""
+    this and lose no more than 2 % in the other."""
     head: bool = True
     """Propose a scoring head too: a logistic regression on what is measured of each grasp."""
     run: bool = True

@@ -27,9 +27,9 @@ class DiffusionConfig:
     """The hand the weights were trained for; they lie in `models/weights/graspgen_<gripper>.npz`."""
     weights: Path | None = None
     """Another weights file, its checksum beside it."""
-    steps: int = 5
+    steps: int = 8
     """Denoising steps."""
-    temperature: float = 1.0
+    temperature: float = 0.78
     """Spread of the starting noise; below 1 grasps are safer and less varied."""
     drawn: float = 2.25
     """Grasps drawn for each that is given out: the discriminator keeps the rest back. 1 gives out all."""

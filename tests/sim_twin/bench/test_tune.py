@@ -96,6 +96,14 @@ def test_what_wins_in_one_reading_and_loses_in_the_other_is_not_taken(fitted):
     assert "but 72 against 81 (fallthrough)" in family.why
 
 
+@pytest.mark.parametrize(("lost", "tuned"), [(1, True), (2, False)])
+def test_one_of_81_lost_in_the_other_reading_says_nothing(fitted, lost: int, tuned: bool):
+    hand = rows_of(2, "mvb", lambda n: True, rank=1)
+    family = fitted([*TRAIN, *hand, *rows_of(2, "mvb:k=3", lambda n: n >= lost)]).families["mvb"]
+    assert family.proposals[0].tallies["fallthrough"].tuned == 81 - lost
+    assert family.tuned is tuned
+
+
 def test_where_the_hand_set_values_are_best_nothing_is_proposed_nor_run(fitted):
     runs = Runs(lambda *_: True)
     family = fitted([*rows_of(1, "mvb", often), *rows_of(1, "mvb:k=3", half)], runs=runs).families["mvb"]
