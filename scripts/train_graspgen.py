@@ -3,11 +3,12 @@
     python -m scripts.make_grasp_dataset
     nice -n 19 python -m scripts.train_graspgen            # goes on where it stopped; an hour on one core
     python -m scripts.evaluate_graspgen                    # writes models/weights/graspgen_agnostic.json
+    python -m scripts.train_graspgen --run out/graspgen/more --start-from models/weights/graspgen_agnostic.npz
 
     python -m scripts.make_grasp_dataset --gripper z1 --shards 24
     python -m scripts.train_graspgen --gripper z1 --start-from models/weights/graspgen_agnostic.npz
 
-Checkpoints lie in out/graspgen/. With the same data, seed, torch version and machine the weights come out the same.
+Checkpoints lie in the run's folder. With the same data, seed, torch version and machine the weights come out the same.
 """
 
 from __future__ import annotations
@@ -44,12 +45,14 @@ class Config:
     """Which hand of `models.graspgen.labels.GRIPPERS`."""
     data: Path = Path("out/graspgen")
     """Folder that `make_grasp_dataset` wrote."""
+    run: Path = Path("out/graspgen")
+    """Folder for checkpoints; give another one to start anew."""
     threads: int = 1
     """Processor threads."""
     weights: Path | None = None
     """Where the weights go; beside the shipped ones if not given."""
     start_from: Path | None = None
-    """Weights of another hand, whose generator is tuned for this one."""
+    """Weights whose generator is trained on, or that of another hand is tuned for this one."""
     held_back: int = 80
     """Shapes that calibrate the discriminator and that nothing was trained on."""
     held_back_seed: int = 500_000
@@ -64,7 +67,8 @@ def main(config: Config) -> None:
     gripper = GRIPPERS[config.gripper]
     data = load_shards(config.data / config.gripper)
     console.print(f"{len(data.family)} shapes, {len(data.clouds)} views")
-    stem = config.data / config.gripper
+    stem = config.run / config.gripper
+    stem.mkdir(parents=True, exist_ok=True)
     reporter = _Reporter(console, stem.with_suffix(".curves.json"))
     generator = train_generator(
         data,
@@ -112,7 +116,10 @@ def main(config: Config) -> None:
     digest = save_weights(path, generator, discriminator)
     recipe = {"shapes": len(data.family), "views": len(data.clouds), "training": asdict(config.training)}
     recipe |= {"start_from": config.start_from.name if config.start_from else None, "gripper": asdict(gripper)}
-    recipe |= {"labels_shaken": _count_shaken(stem), "samples_shaken": {"tried": judged.shaken, "lost": judged.lost}}
+    recipe |= {
+        "labels_shaken": _count_shaken(config.data / config.gripper),
+        "samples_shaken": {"tried": judged.shaken, "lost": judged.lost},
+    }
     recipe |= {"calibration": {"shapes": config.held_back, "scale": round(scale, 4), "offset": round(offset, 4)}}
     recipe |= {"torch": torch.__version__, "losses": reporter.curves}
     path.with_suffix(".recipe.json").write_text(json.dumps(recipe, indent=1) + "\n")
