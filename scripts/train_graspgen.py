@@ -115,7 +115,7 @@ def main(config: Config) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     digest = save_weights(path, generator, discriminator)
     recipe = {"shapes": len(data.family), "views": len(data.clouds), "training": asdict(config.training)}
-    recipe |= {"start_from": config.start_from.name if config.start_from else None, "gripper": asdict(gripper)}
+    recipe |= {"start_from": _origin(config.start_from), "gripper": asdict(gripper)}
     recipe |= {
         "labels_shaken": _count_shaken(config.data / config.gripper),
         "samples_shaken": {"tried": judged.shaken, "lost": judged.lost},
@@ -134,6 +134,14 @@ def _held_back(config: Config) -> GraspData:
     if not path.exists():
         save_shard(path, make_shard(GRIPPERS[config.gripper], config.held_back_seed, config.held_back, n_views=2))
     return load_shards(folder)
+
+
+def _origin(weights: Path | None) -> dict | None:
+    """Return what the recipe says of weights that were started from: their name and, if it is there, their recipe."""
+    if weights is None:
+        return None
+    path = weights.with_suffix(".recipe.json")
+    return {"name": weights.name, "recipe": json.loads(path.read_text()) if path.exists() else None}
 
 
 def _count_shaken(folder: Path) -> dict[str, dict[str, int]]:
