@@ -28,7 +28,7 @@ class YoloConfig:
     """What is not above this is not seen, in [0, 1)."""
     max_iou: float = 0.5
     """Of two boxes of a class that overlap more, the less confident is dropped. Ultralytics' own value, 0.7, leaves
-    second boxes of one object: box mAP50 0.972 for 0.974 on 300 pictures that are neither of training nor held out."""
+    second boxes of one object: on 300 pictures of no other use box mAP50 is 0.972 with it, 0.974 with this."""
     max_detections: int = 20
     """Most objects of an image."""
     every_class: bool = False

@@ -154,10 +154,10 @@ def _candidates(scores: np.ndarray, min_confidence: float, every_class: bool) ->
 
 def _suppressed(corners: np.ndarray, scores: np.ndarray, classes: np.ndarray, max_iou: float) -> np.ndarray:
     """Return which of the boxes `corners` (N, 4) survive within their class, most confident first."""
+    if not len(corners):
+        return np.empty(0, dtype=int)
     boxes = np.concatenate([corners[:, :2], corners[:, 2:] - corners[:, :2]], axis=1)
-    kept = (
-        cv2.dnn.NMSBoxesBatched(boxes.tolist(), scores.tolist(), classes.tolist(), 0.0, max_iou) if len(boxes) else ()
-    )
+    kept = cv2.dnn.NMSBoxesBatched(boxes.tolist(), scores.tolist(), classes.tolist(), 0.0, max_iou)
     return np.sort(np.asarray(kept, dtype=int).reshape(-1))
 
 

@@ -3,6 +3,7 @@
     python -m scripts.make_grasp_dataset                  # 64 shards of 100 shapes × 4 views into out/graspgen/agnostic
     python -m scripts.make_grasp_dataset --shards 2       # a small one
     python -m scripts.make_grasp_dataset --gripper z1     # for the Z1's own beak
+    python -m scripts.make_grasp_dataset --seed 2000 --view.occluded-share 1    # more, all with a part hidden
 
 Shards that exist are kept, so an interrupted run goes on where it stopped. Each is made from its own seed.
 Every label passes the exact check; one of each shape is also shaken in MuJoCo: `<shard>.shaken.json` has the outcome.

@@ -100,7 +100,7 @@ def test_boxes_and_masks_are_those_of_ultralytics(ours, checkpoint, shape):
     assert all(d.mask.shape == shape for d in found)
 
 
-def test_every_class_of_a_box_counts_as_in_ultralytics_validator(ours, checkpoint):
+def test_every_class_of_a_box_counts_as_in_ultralytics_validator(ours):
     """An untrained network holds every class possible nearly everywhere."""
     from ultralytics.utils.nms import non_max_suppression
 
