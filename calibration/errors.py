@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from hal.base.errors import Z1Error
 
-class CalibrationError(ValueError):
+
+class CalibrationError(Z1Error, ValueError):
     """A calibration that cannot be done, read or used; `code` is for programs, the message for the operator."""
 
     def __init__(self, code: str, message: str) -> None:
-        super().__init__(message)
-        self.code = code
+        super().__init__(message, code=code)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from calibration.board import Board
+from calibration.board.board import Board
+from calibration.board.detection import BoardView
+from calibration.board.pose import check_corners
 from calibration.camera_model import CameraModel
-from calibration.detection import BoardView
 from calibration.errors import CalibrationError, CalibrationWarning
-from calibration.pose import check_corners
 
 MIN_VIEWS = 5
 """Fewer views are refused."""

@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 
 from calibration import plots
-from calibration.detection import BoardView
-from calibration.hand_eye_result import HandEyeResult
+from calibration.board.detection import BoardView
+from calibration.hand_eye.result import HandEyeResult
+from calibration.hand_eye.uncertainty import COVERAGE
 from calibration.intrinsics import IntrinsicsResult
 from calibration.results import Calibration
 from calibration.transforms import distance, inverse, rotation_vectors
-from calibration.uncertainty import COVERAGE
 
 _STYLE = """body{font:15px/1.5 system-ui,sans-serif;max-width:62rem;margin:2rem auto;padding:0 1rem;color:#1a202c}
 h1,h2{line-height:1.2}figure{margin:1rem 0}figcaption{color:#4a5568}table{border-collapse:collapse}

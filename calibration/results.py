@@ -14,13 +14,14 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from calibration.board import Board
+from calibration.board.board import Board
 from calibration.camera_model import CameraModel
 from calibration.errors import CalibrationError, CalibrationWarning
 from calibration.files import write_new
-from calibration.hand_eye_result import HandEyeResult, Setup
+from calibration.hand_eye.result import HandEyeResult, Setup
 from calibration.intrinsics import IntrinsicsResult
 from calibration.transforms import check_poses
+from hal.base.errors import InvalidValueError
 
 logger = logging.getLogger(__name__)
 
@@ -223,7 +224,7 @@ def _read(path: Path) -> Calibration:
     try:
         values = json.loads(path.read_text())
         if values["format"] != FORMAT:
-            raise ValueError(f"its format is {values['format']!r}, known is {FORMAT}")
+            raise InvalidValueError(f"its format is {values['format']!r}, known is {FORMAT}")
         arrays = {
             name: None if values[name] is None else np.array(values[name], dtype=np.float64)
             for name in ("T_mount_camera", "T_anchor_board", "covariance")

@@ -16,12 +16,13 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from calibration.board import Board
+from calibration.board.board import Board
 from calibration.camera_model import CameraModel
 from calibration.errors import CalibrationError, CalibrationWarning
 from calibration.files import write_new
-from calibration.hand_eye_result import Setup
+from calibration.hand_eye.result import Setup
 from calibration.transforms import check_poses
+from hal.base.errors import InvalidValueError
 
 FORMAT = 1
 """Of the files; one that a newer version wrote is refused rather than guessed at."""
@@ -111,7 +112,7 @@ def load_session(folder: Path) -> Session:
     try:
         values = json.loads(path.read_text())
         if values["format"] != FORMAT:
-            raise ValueError(f"its format is {values['format']!r}, known is {FORMAT}")
+            raise InvalidValueError(f"its format is {values['format']!r}, known is {FORMAT}")
         return Session(
             board=Board.from_dict(values["board"]),
             serial=str(values["serial"]),
@@ -171,10 +172,10 @@ def load_samples(folder: Path) -> LoadedSamples:
 def _load_sample(folder: Path, name: str, session: Session) -> Sample:
     values = json.loads((folder / f"{name}.json").read_text())
     if values["format"] != FORMAT:
-        raise ValueError(f"its format is {values['format']!r}, known is {FORMAT}.")
+        raise InvalidValueError(f"its format is {values['format']!r}, known is {FORMAT}.")
     picture = (folder / f"{name}.png").read_bytes()
     if hashlib.sha256(picture).hexdigest() != values["image_sha256"]:
-        raise ValueError("its picture is not the one that was taken (checksum).")
+        raise InvalidValueError("its picture is not the one that was taken (checksum).")
     with Image.open(io.BytesIO(picture)) as image:
         pixels = np.asarray(image)
     sample = Sample(

@@ -9,11 +9,11 @@ from threading import Event
 
 import numpy as np
 
-from hal import z1
-from hal.errors import CommandRefusedError, GuardError, HalError, StoppedError
-from hal.limits import ServoLimits
-from hal.messages import ServoMode, TrajectoryChunk, frozen_array
-from hal.servo import Servo
+from hal.base import z1
+from hal.base.errors import CommandRejectedError, GuardError, HalError, StoppedError
+from hal.base.messages import ServoMode, TrajectoryChunk, frozen_array
+from hal.servo.limits import ServoLimits
+from hal.servo.servo import Servo
 
 _LOG = logging.getLogger(__name__)
 _OWNER = "the HAL's ending"
@@ -54,7 +54,7 @@ def park(servo: Servo, parking: Parking, give_up: Event) -> bool:
     try:
         _take_over(servo)
         if abs(servo.read_state().tau[z1.N_ARM]) > _SQUEEZES_NM:
-            raise CommandRefusedError("the gripper holds something.")
+            raise CommandRejectedError("the gripper holds something.")
         try:
             _drive(servo, parking.q, parking.speed_rad_s, give_up)
         except GuardError as error:

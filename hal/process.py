@@ -12,18 +12,18 @@ from threading import Event, Thread
 
 import numpy as np
 
+from hal.base.errors import HalError, InvalidValueError
+from hal.base.messages import ServoMode
+from hal.base.z1 import CONTROL_PERIOD_S, N_ARM
 from hal.bus.server import HalServer
 from hal.bus.session import BusConfig
-from hal.errors import HalError
-from hal.guard import Guard, Workspace
-from hal.limits import ServoLimits
-from hal.messages import ServoMode
 from hal.parking import Parking, park
-from hal.readonly import ReadonlyServo
 from hal.rig import Rig
-from hal.servo import Servo
-from hal.servo_thread import ServoThread, collect_garbage
-from hal.z1 import CONTROL_PERIOD_S, N_ARM
+from hal.servo.guard import Guard, Workspace
+from hal.servo.limits import ServoLimits
+from hal.servo.monitor_only import ReadonlyServo
+from hal.servo.servo import Servo
+from hal.servo.servo_thread import ServoThread, collect_garbage
 
 _LOG = logging.getLogger(__name__)
 HEARTBEAT_TIMEOUT_S = 0.15
@@ -80,7 +80,7 @@ def serve(
         ValueError: the rig is a lock-step one.
     """
     if rig.call_every_tick is not None:
-        raise ValueError("a lock-step rig has no time of its own to be served by; make it with the wall clock.")
+        raise InvalidValueError("a lock-step rig has no time of its own to be served by; make it with the wall clock.")
     kind = ReadonlyServo if readonly else Servo
     servo = kind(rig.arm, rig.clock, limits, heartbeat_timeout_s=HEARTBEAT_TIMEOUT_S)
     ticking = ServoThread(servo, rig.clock, cpu=cpu)

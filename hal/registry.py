@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from importlib import import_module
 from typing import Any, Generic, TypeVar
 
-from hal.arm import Arm
-from hal.camera import Camera
-from hal.errors import UnknownBackendError
+from hal.base.arm import Arm
+from hal.base.camera import Camera
+from hal.base.errors import InvalidValueError, UnknownBackendError
 
 T = TypeVar("T")
 
@@ -27,7 +27,7 @@ class Registry(Generic[T]):
             ValueError: the name is taken.
         """
         if name in self._entries:
-            raise ValueError(f"{self._kind} backend {name!r} is registered already, as {self._entries[name]}.")
+            raise InvalidValueError(f"{self._kind} backend {name!r} is registered already, as {self._entries[name]}.")
         self._entries[name] = target
 
     def names(self) -> list[str]:
@@ -51,13 +51,13 @@ ARMS: Registry[Arm] = Registry(
     {
         "mock": "hal.backends.mock_arm:MockArm",
         "sim": "sim_twin.backends:TwinArm",
-        "z1": "hal.backends.z1_arm:Z1Arm",
+        "z1": "hal.backends.z1.arm:Z1Arm",
     },
 )
 CAMERAS: Registry[Camera] = Registry(
     "camera",
     {
-        "d405": "hal.backends.d405_camera:D405Camera",
+        "d405": "hal.backends.d405.camera:D405Camera",
         "replay": "hal.backends.replay_camera:ReplayCamera",
         "sim": "sim_twin.backends:TwinCamera",
     },

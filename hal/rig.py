@@ -6,9 +6,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from hal.arm import Arm
-from hal.camera import Camera
-from hal.clock import Clock
+from hal.base.arm import Arm
+from hal.base.camera import Camera
+from hal.base.clock import Clock
 from hal.parking import Parking
 from hal.registry import Registry
 
@@ -22,7 +22,7 @@ class Rig:
     clock: Clock
     call_every_tick: Callable[[Callable[[], None]], None] | None = None
     """In lock-step: registers what the clock calls every control period while somebody sleeps on it. None when the
-    clock is the wall's, where `hal.servo_thread.ServoThread` does the calling."""
+    clock is the wall's, where `hal.servo.servo_thread.ServoThread` does the calling."""
     independent: bool = False
     """Arm and camera are devices of their own, which can be connected at the same time."""
     park: Parking | None = None
@@ -37,6 +37,6 @@ RIGS: Registry[Rig] = Registry(
         "mock": "hal.backends.mock_arm:make_rig",
         "real": "hal.backends.real_rig:make_rig",
         "sim": "sim_twin.backends:make_rig",
-        "wire-sim": "sim_twin.wire_rig:make_wire_rig",
+        "wire-sim": "sim_twin.drop_in.rig:make_wire_rig",
     },
 )

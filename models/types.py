@@ -7,6 +7,8 @@ from typing import Protocol
 
 import numpy as np
 
+from hal.base.errors import InvalidValueError
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class GraspSet:
@@ -27,7 +29,7 @@ class GraspSet:
     def __post_init__(self) -> None:
         n = len(self.T_camera_grasps)
         if self.T_camera_grasps.shape != (n, 4, 4) or self.scores.shape != (n,) or self.widths_m.shape != (n,):
-            raise ValueError(
+            raise InvalidValueError(
                 f"GraspSet wants (N, 4, 4), (N,), (N,); got {self.T_camera_grasps.shape}, "
                 f"{self.scores.shape}, {self.widths_m.shape}."
             )
@@ -85,11 +87,11 @@ def check_request(points: np.ndarray, n: int) -> np.ndarray:
     """
     points = np.asarray(points, dtype=np.float64)
     if n < 1:
-        raise ValueError(f"Asked for {n} grasps; ask for one or more.")
+        raise InvalidValueError(f"Asked for {n} grasps; ask for one or more.")
     if points.ndim != 2 or points.shape[1] != 3 or len(points) < MIN_CLOUD_POINTS:
-        raise ValueError(f"Grasps need a cloud (M, 3) of {MIN_CLOUD_POINTS} points or more; got {points.shape}.")
+        raise InvalidValueError(f"Grasps need a cloud (M, 3) of {MIN_CLOUD_POINTS} points or more; got {points.shape}.")
     if not np.isfinite(points).all():
-        raise ValueError("The cloud holds points that are NaN or infinite; drop invalid depth first.")
+        raise InvalidValueError("The cloud holds points that are NaN or infinite; drop invalid depth first.")
     return points
 
 
@@ -108,7 +110,7 @@ def check_object_cloud(points: np.ndarray, n: int) -> np.ndarray:
     points = check_request(points, n)
     extent = float(np.ptp(points, axis=0).max())
     if not SMALLEST_OBJECT_M < extent < LARGEST_OBJECT_M:
-        raise ValueError(
+        raise InvalidValueError(
             f"The cloud spans {extent:.4g} m; allowed is {SMALLEST_OBJECT_M} to {LARGEST_OBJECT_M} m. "
             "Give one object's points, in metres (not millimetres)."
         )

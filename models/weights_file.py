@@ -10,11 +10,15 @@ from pathlib import Path
 
 import numpy as np
 
+from hal.base.errors import InvalidValueError, Z1Error
+
 WEIGHTS_FOLDER = Path(__file__).resolve().parent / "weights"
 
 
-class WeightsError(ValueError):
+class WeightsError(Z1Error, ValueError):
     """A weights file that is missing, damaged or of another network."""
+
+    default_code = "weights"
 
 
 def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> str:
@@ -26,7 +30,7 @@ def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> str:
         ValueError: `path` does not end in .npz.
     """
     if path.suffix != ".npz":
-        raise ValueError(f"{path} must end in .npz: weights are kept as NumPy arrays.")
+        raise InvalidValueError(f"{path} must end in .npz: weights are kept as NumPy arrays.")
     partial = path.with_name(f".{path.stem}.{os.getpid()}.npz")
     try:
         np.savez(partial, allow_pickle=False, **arrays)

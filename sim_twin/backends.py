@@ -17,23 +17,24 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 
-from hal import z1
-from hal.clock import Clock, WallClock
-from hal.errors import HalTimeoutError, NotConnectedError
-from hal.messages import ArmSetpoint, ArmState, Intrinsics, RgbdFrame
+from hal.base import z1
+from hal.base.clock import Clock, WallClock
+from hal.base.errors import HalTimeoutError, NotConnectedError
+from hal.base.messages import ArmSetpoint, ArmState, Intrinsics, RgbdFrame
 from hal.rig import Rig
-from sim_twin import d405
+from sim_twin.camera import d405
+from sim_twin.camera.render import make_renderer
+from sim_twin.camera.wrist_view import View, WristRenderer
 from sim_twin.clock import TwinClock
-from sim_twin.render import View, WristRenderer, make_renderer
-from sim_twin.scene import SceneConfig
-from sim_twin.world import World
+from sim_twin.model.scene import SceneConfig
+from sim_twin.model.world import World
 
 _MAX_CATCH_UP_S = 0.020
 """Most simulated time one read may make up; the rest of a delay is dropped, so the world slows and never bursts."""
 
 
 class TwinArm:
-    """`hal.arm.Arm` of the simulated Z1; moves between threads as the world does (under its lock).
+    """`hal.base.arm.Arm` of the simulated Z1; moves between threads as the world does (under its lock).
 
     A setpoint takes effect as many setpoints later as the scene's `arm_latency_s` says; a stop does at once.
 
@@ -108,14 +109,14 @@ class TwinArm:
 
 
 class TwinCamera:
-    """`hal.camera.Camera` of the simulated D405: 640×480 at 30 Hz, with the object's exact mask.
+    """`hal.base.camera.Camera` of the simulated D405: 640×480 at 30 Hz, with the object's exact mask.
 
     Drawing happens in a thread of its own, as an OpenGL context belongs to one thread.
 
     Args:
         world: what it looks at; by default one of its own with the default scene.
         clock: a `TwinClock` of that world for lock-step (the default), any other for real time.
-        renderer: one of `sim_twin.render.RENDERERS`; by default what the environment says.
+        renderer: one of `sim_twin.camera.render.RENDERERS`; by default what the environment says.
     """
 
     def __init__(self, world: World | None = None, clock: Clock | None = None, renderer: str | None = None) -> None:

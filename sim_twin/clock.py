@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from hal.z1 import CONTROL_PERIOD_S
-from sim_twin.world import World
+from hal.base.z1 import CONTROL_PERIOD_S
+from sim_twin.model.world import World
 
 
 class TwinClock:

@@ -6,7 +6,7 @@ import os
 
 from hypothesis import settings
 
-pytest_plugins = ["faults_table"]
+pytest_plugins = ["tests.support.faults_table"]
 
 # The suite tries the same examples every time, so that a red run is red again; to look for new ones:
 # HYPOTHESIS_PROFILE=explore ./z1 test

@@ -10,18 +10,16 @@ from typing import Any, Literal, TypeVar, get_args
 
 import yaml
 
-from models.detector_runtimes import RUNTIMES
-from models.generators import Process, generator_for, split_generator_name
-from z1_runtime.detectors import DETECTORS
-from z1_runtime.executor import ExecutorConfig
-from z1_runtime.perception import PerceptionConfig
-from z1_runtime.planner import PlannerConfig
+from hal.base.errors import ConfigError, InvalidValueError
+from models.detector.runtimes import RUNTIMES
+from models.factory import Process, generator_for, split_generator_name
+from z1_runtime.grasping.ranking import Ranking, load_scoring
+from z1_runtime.motion.executor import ExecutorConfig
+from z1_runtime.perception.detectors import DETECTORS
+from z1_runtime.perception.segmentation import PerceptionConfig
+from z1_runtime.planning.planner_config import PlannerConfig
 
 T = TypeVar("T")
-
-
-class ConfigError(ValueError):
-    """A configuration file that cannot be used; the message names the key."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -50,7 +48,7 @@ class RuntimeConfig:
     generator_process: Process = "in"
     """Where `graspgen` and `graspgenx` run: `in` the runtime's process, or in their `own`."""
     generator_python: str = ""
-    """The Python of that process; empty = that of `python -m scripts.make_generator_env`."""
+    """The Python of that process; empty = that of `python -m scripts.train.make_generator_env`."""
     n_candidates: int = 800
     """Grasps the generator proposes (the paper's N)."""
     seed: int = 0
@@ -166,6 +164,22 @@ def with_generator(config: RuntimeConfig, generator: str | None, weights: Path |
     return config if generator is None else replace(config, generator=generator)
 
 
+def ranking_of(config: RuntimeConfig) -> Ranking:
+    """Return the numbers that `config` ranks by: those of its scoring file, or else its own.
+
+    Raises:
+        ScoringError: the file cannot be used.
+    """
+    if config.scoring:
+        return load_scoring(Path(config.scoring)).full
+    return hand_set(config)
+
+
+def hand_set(config: RuntimeConfig) -> Ranking:
+    """Return the numbers that stand in `config` itself."""
+    return Ranking(k_faces=config.k_faces, alpha=config.alpha, box_method=config.box_method)
+
+
 def save_config(config: RuntimeConfig, path: Path) -> None:
     """Write `config` as YAML that `load_config` reads back to an equal one."""
     path.write_text(yaml.safe_dump(asdict(config), sort_keys=False))
@@ -203,4 +217,4 @@ def _converted(old: Any, value: Any, where: str) -> Any:
 
 def _require(ok: bool, name: str, seen: object, allowed: str) -> None:
     if not ok:
-        raise ValueError(f"{name} is {seen}; allowed is {allowed}.")
+        raise InvalidValueError(f"{name} is {seen}; allowed is {allowed}.")

@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from hal.messages import RgbdFrame
+from hal.base.messages import RgbdFrame
 from models.types import Detection
 
 IkMethod = Literal["analytic", "least_squares"]
@@ -44,7 +44,7 @@ class Observation:
     """(M, 3) everything else that was seen: the table, neighbours, walls; not the object."""
     table: Plane
     hidden_points: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
-    """(K, 3) where the object may go on, but its sight was blocked; see `z1_runtime.hidden`."""
+    """(K, 3) where the object may go on, but its sight was blocked; see `z1_runtime.perception.occlusion`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from hal.clock import Clock, WallClock
-from hal.errors import CommandRefusedError, HalTimeoutError, NotConnectedError
-from hal.messages import ArmSetpoint, ArmState
+from hal.base.clock import Clock, WallClock
+from hal.base.errors import CommandRejectedError, HalTimeoutError, NotConnectedError
+from hal.base.messages import ArmSetpoint, ArmState
+from hal.base.z1 import KP, N_JOINTS, Q_HOME, Q_MAX, Q_MIN, TAU_MAX
 from hal.rig import Rig
-from hal.z1 import KP, N_JOINTS, Q_HOME, Q_MAX, Q_MIN, TAU_MAX
 
 STALE_S = 0.1
 """A measurement older than this is refused [s]."""
@@ -71,7 +71,7 @@ class MockArm:
     def send(self, setpoint: ArmSetpoint) -> ArmSetpoint:
         self._check_connected()
         if self.refuse_commands:
-            raise CommandRefusedError("the mock arm refuses commands, as it was told to.")
+            raise CommandRejectedError("the mock arm refuses commands, as it was told to.")
         self._move(self.clock.now_s())
         q = np.clip(setpoint.q, Q_MIN, Q_MAX)
         if not self.drop_commands:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from typing import Any
 
-from hal.backends.d405_session import D405CameraConfig
-from hal.backends.z1_arm import Z1Arm
-from hal.backends.z1_config import Z1ArmConfig
-from hal.clock import WallClock
+from hal.backends.d405.session import D405CameraConfig
+from hal.backends.z1.arm import Z1Arm
+from hal.backends.z1.config import Z1ArmConfig
+from hal.base.clock import WallClock
 from hal.parking import Parking
 from hal.registry import CAMERAS
 from hal.rig import Rig
-from hal.wire.controller import LABELS
+from hal.z1_protocol.controller import LABELS
 
 SEARCH_S = 1.0
 """How long arm and camera are looked for: whoever has neither knows it 3 s after he has asked [s]."""
@@ -22,7 +22,7 @@ def make_rig(*, arm: Z1ArmConfig | None = None, camera: Any = None, **_: Any) ->
 
     Args:
         arm: where the controller is and how to use it.
-        camera: a `hal.backends.d405_camera.D405CameraConfig`.
+        camera: a `hal.backends.d405.camera.D405CameraConfig`.
         **_: options of other rigs.
     """
     clock = WallClock()

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from hal.clock import Clock, WallClock
-from hal.errors import CameraError, HalTimeoutError, NotConnectedError
-from hal.messages import Intrinsics, RgbdFrame
+from hal.base.clock import Clock, WallClock
+from hal.base.errors import CameraError, HalTimeoutError, NotConnectedError
+from hal.base.messages import Intrinsics, RgbdFrame
 
 _PERIOD_S = 1 / 30
 

@@ -11,21 +11,21 @@ from typing import Self
 
 import zenoh
 
+from hal.base.clock import Clock, WallClock
+from hal.base.errors import HalTimeoutError, NotConnectedError
+from hal.base.messages import ArmSetpoint, ArmState, ServoStatus, TrajectoryChunk
 from hal.bus import keys
 from hal.bus.codec import decode, encode
 from hal.bus.link import Link
 from hal.bus.remote_camera import RemoteCamera as RemoteCamera  # noqa: PLC0414 (a re-export)
 from hal.bus.service import Listener, as_bytes
 from hal.bus.session import BusConfig
-from hal.clock import Clock, WallClock
-from hal.errors import HalTimeoutError, NotConnectedError
-from hal.messages import ArmSetpoint, ArmState, ServoStatus, TrajectoryChunk
 
 _LOG = logging.getLogger(__name__)
 
 
 class RemoteArm:
-    """The servoed arm of a HAL process (`hal.arm.ServoedArm`).
+    """The servoed arm of a HAL process (`hal.base.arm.ServoedArm`).
 
     While it holds the lease it sends the heartbeat from a thread of its own: should this process die, or hold the
     interpreter for longer than 0.15 s in one piece, the servo brakes.
@@ -98,7 +98,7 @@ class RemoteArm:
     # --- Arm ------------------------------------------------------------------------------------------------------
 
     def read_state(self) -> ArmState:
-        """Return the newest published measurement (about 10 ms old; see `hal.arm.Arm.read_state`)."""
+        """Return the newest published measurement (about 10 ms old; see `hal.base.arm.Arm.read_state`)."""
         state, age_s = self._newest_state()
         if age_s > self._config.state_max_age_s:
             # Whoever kept this process from running kept the listener from it, too: what is there may wait unheard.
@@ -113,7 +113,7 @@ class RemoteArm:
         return state
 
     def send(self, setpoint: ArmSetpoint) -> ArmSetpoint:
-        """Hand over one setpoint (see `hal.arm.Arm.send`)."""
+        """Hand over one setpoint (see `hal.base.arm.Arm.send`)."""
         return decode(self._connected().ask(keys.SEND, encode(setpoint), self._name()), ArmSetpoint)
 
     def stop(self, reason: str = "") -> None:
@@ -127,7 +127,7 @@ class RemoteArm:
     # --- Servo ----------------------------------------------------------------------------------------------------
 
     def claim(self, owner: str = "") -> None:
-        """Take the command lease (see `hal.arm.ServoedArm.claim`) and begin the heartbeat.
+        """Take the command lease (see `hal.base.arm.ServoedArm.claim`) and begin the heartbeat.
 
         Args:
             owner: a name to show others; default is the one given at the start.
@@ -140,7 +140,7 @@ class RemoteArm:
             self._heart = _Heart(link.session, name, 1.0 / self._config.heartbeat_rate_hz)
 
     def release(self) -> None:
-        """Give the lease back (see `hal.arm.ServoedArm.release`)."""
+        """Give the lease back (see `hal.base.arm.ServoedArm.release`)."""
         link = self._connected()
         name = self._name()
         try:
@@ -149,7 +149,7 @@ class RemoteArm:
             self._stop_heart()
 
     def stream(self, chunk: TrajectoryChunk) -> None:
-        """Queue a piece of a trajectory; returns when the servo has taken it (see `hal.arm.ServoedArm.stream`)."""
+        """Queue a piece of a trajectory; returns when the servo has taken it (see `hal.base.arm.ServoedArm.stream`)."""
         self._connected().ask(keys.CHUNK, encode(chunk), self._name())
 
     def status(self) -> ServoStatus:
@@ -160,7 +160,7 @@ class RemoteArm:
         return decode(self._connected().ask(keys.READ_STATUS), ServoStatus)
 
     def rearm(self) -> None:
-        """Lift a latched stop (see `hal.arm.ServoedArm.rearm`)."""
+        """Lift a latched stop (see `hal.base.arm.ServoedArm.rearm`)."""
         self._connected().ask(keys.REARM, owner=self._name())
         self._stop_heart()
 

@@ -18,8 +18,8 @@ from typing import Any, get_args, get_type_hints
 import msgpack
 import numpy as np
 
-import hal.messages
-from hal.errors import InvalidMessageError
+import hal.base.messages
+from hal.base.errors import InvalidMessageError
 
 VERSION = 1
 MAX_BYTES = 64 * 2**20
@@ -45,7 +45,7 @@ class Hello:
 
 
 MESSAGES: dict[str, type] = {
-    name: kind for name, kind in inspect.getmembers(hal.messages, inspect.isclass) if is_dataclass(kind)
+    name: kind for name, kind in inspect.getmembers(hal.base.messages, inspect.isclass) if is_dataclass(kind)
 } | {"Hello": Hello}
 
 

@@ -12,9 +12,9 @@ from pathlib import Path
 import zenoh
 from zenoh import shm
 
+from hal.base.errors import InvalidMessageError
+from hal.base.messages import Intrinsics, RgbdFrame
 from hal.bus.codec import encode_into
-from hal.errors import InvalidMessageError
-from hal.messages import Intrinsics, RgbdFrame
 
 _LOG = logging.getLogger(__name__)
 _SHM_DIR = Path("/dev/shm")

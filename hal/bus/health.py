@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import queue
 
+from hal.base.clock import Clock
+from hal.base.errors import HalTimeoutError
+from hal.base.messages import ServoHealth
 from hal.bus import keys
 from hal.bus.codec import decode
 from hal.bus.link import Link
 from hal.bus.service import Listener, as_bytes
 from hal.bus.session import BusConfig
-from hal.clock import Clock
-from hal.errors import HalTimeoutError
-from hal.messages import ServoHealth
 
 
 def wait_for_health(config: BusConfig, clock: Clock, timeout_s: float = 3.0) -> ServoHealth:

@@ -6,14 +6,14 @@ import threading
 
 import zenoh
 
+from hal.base.clock import Clock
+from hal.base.errors import HalError, HalTimeoutError, NotConnectedError
 from hal.bus import keys
 from hal.bus.codec import Hello, decode
 from hal.bus.frames import existing_segments, mapped_segments, unlink_segments
 from hal.bus.service import as_bytes
 from hal.bus.session import BusConfig, nobody_answers, open_session
 from hal.bus.wire_errors import decode_error
-from hal.clock import Clock
-from hal.errors import HalError, HalTimeoutError, NotConnectedError
 
 _RETRY_S = 0.05
 _SAME_CLOCK_S = 0.05

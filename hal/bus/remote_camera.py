@@ -12,15 +12,15 @@ from typing import Self
 import numpy as np
 import zenoh
 
+from hal.base.clock import Clock, WallClock
+from hal.base.errors import HalTimeoutError, InvalidMessageError, NotConnectedError
+from hal.base.messages import Intrinsics, RgbdFrame
 from hal.bus import keys
 from hal.bus.codec import decode
 from hal.bus.frames import FrameStamp
 from hal.bus.link import Link
 from hal.bus.service import Listener, as_bytes
 from hal.bus.session import BusConfig
-from hal.clock import Clock, WallClock
-from hal.errors import HalTimeoutError, InvalidMessageError, NotConnectedError
-from hal.messages import Intrinsics, RgbdFrame
 
 _LOG = logging.getLogger(__name__)
 _LATENCIES_KEPT = 1000
@@ -28,7 +28,7 @@ _FRAMES_WAITING = 2
 
 
 class RemoteCamera:
-    """The camera of a HAL process (`hal.camera.Camera`).
+    """The camera of a HAL process (`hal.base.camera.Camera`).
 
     Holds the newest frame only, still packed; it is unpacked in the thread of whoever waits for it. Any number of
     threads may wait at once. It listens from the first call that waits to the first frame that nobody waits for: what
@@ -100,7 +100,7 @@ class RemoteCamera:
 
     @property
     def intrinsics(self) -> Intrinsics:
-        """Of both images of every frame (see `hal.camera.Camera.intrinsics`)."""
+        """Of both images of every frame (see `hal.base.camera.Camera.intrinsics`)."""
         if self._link is None or self._intrinsics is None:
             raise NotConnectedError("the remote camera")
         return self._intrinsics
@@ -116,7 +116,7 @@ class RemoteCamera:
         return float(np.percentile(latencies_ms, percentile)) if latencies_ms else 0.0
 
     def wait_for_frame(self, timeout_s: float) -> RgbdFrame:
-        """Return the next frame exposed after this call began (see `hal.camera.Camera.wait_for_frame`).
+        """Return the next frame exposed after this call began (see `hal.base.camera.Camera.wait_for_frame`).
 
         Raises:
             InvalidMessageError: a frame came that cannot be read.

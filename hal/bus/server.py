@@ -22,16 +22,16 @@ from typing import Protocol
 
 import zenoh
 
-from hal.arm import ServoedArm
+from hal.base.arm import ServoedArm
+from hal.base.camera import Camera
+from hal.base.clock import Clock
+from hal.base.errors import HalError, InvalidMessageError, LeaseError
+from hal.base.messages import ArmSetpoint, ServoHealth, TrajectoryChunk
 from hal.bus import keys
 from hal.bus.codec import VERSION, Hello, decode, decode_text, encode
 from hal.bus.frames import FrameBuffers, FrameStamp, existing_segments, mapped_segments, unlink_segments
 from hal.bus.service import Answer, GuardedThread, Listener, Service, as_bytes
 from hal.bus.session import BusConfig, open_session
-from hal.camera import Camera
-from hal.clock import Clock
-from hal.errors import HalError, InvalidMessageError, LeaseError
-from hal.messages import ArmSetpoint, ServoHealth, TrajectoryChunk
 
 _LOG = logging.getLogger(__name__)
 _FRAME_TIMEOUT_S = 1.0
@@ -41,7 +41,7 @@ _HEARTBEATS_WAITING = 16
 
 
 class OwnedServo(ServoedArm, Protocol):
-    """What the server needs of `hal.servo.Servo`: a servoed arm that tells its callers apart, thread-safe."""
+    """What the server needs of `hal.servo.servo.Servo`: a servoed arm that tells its callers apart, thread-safe."""
 
     def release(self, owner: str | None = None) -> None: ...
 

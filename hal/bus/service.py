@@ -13,9 +13,9 @@ from typing import Any
 
 import zenoh
 
+from hal.base.errors import HalError, InvalidMessageError
 from hal.bus.codec import decode_text
 from hal.bus.wire_errors import encode_error
-from hal.errors import HalError, InvalidMessageError
 
 _LOG = logging.getLogger(__name__)
 _WAITING = 32

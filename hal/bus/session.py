@@ -10,12 +10,12 @@ from dataclasses import dataclass
 
 import zenoh
 
+from hal.base.errors import HalError, HalTimeoutError, InvalidValueError
 from hal.bus.codec import MAX_BYTES
-from hal.errors import HalError, HalTimeoutError
 
 _LOG = logging.getLogger(__name__)
 _MAX_COMMAND_BYTES = 8 * 2**20
-"""Longest message the HAL process takes; the longest chunk (`hal.playback.MAX_POINTS`) has 1.2 MB."""
+"""Longest message the HAL process takes; the longest chunk (`hal.servo.trajectory_buffer.MAX_POINTS`) has 1.2 MB."""
 _ROBOT = re.compile(r"[A-Za-z0-9_-]{1,40}")
 
 
@@ -44,12 +44,12 @@ class BusConfig:
 
     def __post_init__(self) -> None:
         if not _ROBOT.fullmatch(self.robot):
-            raise ValueError(f"robot is {self.robot!r}; allowed are 1 to 40 letters, digits, `-` and `_`.")
+            raise InvalidValueError(f"robot is {self.robot!r}; allowed are 1 to 40 letters, digits, `-` and `_`.")
         if not 1 <= self.port <= 65535:
-            raise ValueError(f"port is {self.port}; allowed is 1 to 65535.")
+            raise InvalidValueError(f"port is {self.port}; allowed is 1 to 65535.")
         for name in ("connect_timeout_s", "request_timeout_s", "state_max_age_s", "state_rate_hz", "heartbeat_rate_hz"):
             if not 0 < getattr(self, name) < float("inf"):
-                raise ValueError(f"{name} is {getattr(self, name)}; it must be above 0 and finite.")
+                raise InvalidValueError(f"{name} is {getattr(self, name)}; it must be above 0 and finite.")
 
     @property
     def endpoint(self) -> str:

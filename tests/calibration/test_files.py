@@ -12,11 +12,11 @@ import pytest
 
 from calibration.errors import CalibrationError
 from calibration.files import write_new
-from calibration.hand_eye import solve_hand_eye
+from calibration.hand_eye.solver import solve_hand_eye
 from calibration.report import write_report
 from calibration.results import Calibration, load_newest, load_result, save_result
 from calibration.samples import Sample, Session, load_samples, open_session, save_sample
-from tests.calibration.synthetic import BOARD, CAMERA, T_BASE_BOARD, T_FLANGE_CAMERA, record
+from tests.support.calibration_data import BOARD, CAMERA, T_BASE_BOARD, T_FLANGE_CAMERA, record
 
 SESSION = Session(board=BOARD, serial="123", setup="eye_in_hand", camera=CAMERA, date="2026-11-22T10:00:00Z")
 RESULT = Calibration(

@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from calibration.board.detection import BoardView
 from calibration.camera_model import CameraModel
-from calibration.detection import BoardView
 from calibration.errors import CalibrationError
 from calibration.intrinsics import calibrate_intrinsics
 from calibration.report import write_report
 from calibration.results import Calibration, load_newest, save_result
-from tests.calibration.synthetic import BOARD, CAMERA, look_at_board
+from tests.support.calibration_data import BOARD, CAMERA, look_at_board
 
 TRUE = CameraModel(matrix=CAMERA.matrix, distortion=np.array([-0.05, 0.06, 1e-3, -5e-4, 0.0]), size=CAMERA.size)
 

@@ -10,14 +10,14 @@ from threading import Event
 import numpy as np
 import pytest
 
-from hal import z1
 from hal.backends.mock_arm import MockArm
-from hal.clock import WallClock
-from hal.guard import Guard
-from hal.messages import ServoMode
+from hal.base import z1
+from hal.base.clock import WallClock
+from hal.base.messages import ServoMode
 from hal.parking import Parking, park
-from hal.servo import Servo
-from hal.servo_thread import ServoThread
+from hal.servo.guard import Guard
+from hal.servo.servo import Servo
+from hal.servo.servo_thread import ServoThread
 
 FOLDED = np.array([0.0, 0.0, -0.005, -0.074, 0.0, 0.0])
 QUICK = Parking(q=FOLDED, speed_rad_s=3.0)

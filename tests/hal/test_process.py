@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 
 from hal.backends.mock_arm import MockArm, make_rig
+from hal.base.clock import WallClock
+from hal.base.errors import CameraError, HalError, HalTimeoutError, NotConnectedError
 from hal.bus import keys
 from hal.bus.client import RemoteArm
 from hal.bus.service import Listener
 from hal.bus.session import BusConfig, open_session
-from hal.clock import WallClock
-from hal.errors import CameraError, HalError, HalTimeoutError, NotConnectedError
 from hal.parking import Parking
 from hal.process import serve
 

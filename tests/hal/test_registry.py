@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from hal.backends.mock_arm import MockArm
-from hal.errors import UnknownBackendError
+from hal.base.errors import UnknownBackendError
 from hal.registry import ARMS, Registry
 
 

@@ -11,8 +11,8 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from hal.errors import HalTimeoutError, UnknownBackendError
-from models.obb import DegenerateCloudError
+from hal.base.errors import HalTimeoutError, InvalidValueError, OutputExistsError, UnknownBackendError
+from models.obb.obb import DegenerateCloudError
 from scripts import cli
 
 
@@ -89,12 +89,12 @@ def test_options_reach_the_command_and_its_code_comes_back(made_up: ModuleType) 
 @pytest.mark.parametrize(
     ("module", "error", "code"),
     [
-        ("hal.servo", HalTimeoutError("nobody answers"), 1),
+        ("hal.servo.servo", HalTimeoutError("nobody answers"), 1),
         ("numpy", DegenerateCloudError("four points at least"), 1),
         ("hal.registry", UnknownBackendError("arm", "x", ["mock"]), 2),
-        ("z1_runtime.config", ValueError("alpha is 3"), 2),
-        ("scripts.run_demo", PermissionError("out cannot be written"), 1),
-        ("sim_twin.bench.store", FileExistsError("out holds rows already"), 2),
+        ("z1_runtime.config", InvalidValueError("alpha is 3"), 2),
+        ("scripts.commands.run_demo", PermissionError("out cannot be written"), 1),
+        ("sim_twin.benchmark.results.store", OutputExistsError("out holds rows already"), 2),
     ],
 )
 def test_error_for_the_user_is_one_line(
@@ -122,13 +122,13 @@ def test_debug_shows_the_traceback_of_any_error(
     made_up: ModuleType, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("Z1_DEBUG", "1")
-    made_up.main = raise_in("hal.servo", HalTimeoutError("nobody answers"))  # pyright: ignore[reportAttributeAccessIssue]
+    made_up.main = raise_in("hal.servo.servo", HalTimeoutError("nobody answers"))  # pyright: ignore[reportAttributeAccessIssue]
     assert cli.main(["made-up"]) == 1
     assert "Traceback" in capsys.readouterr().err
 
 
 def test_interrupt_exits_130(made_up: ModuleType) -> None:
-    made_up.main = raise_in("hal.servo", KeyboardInterrupt())  # pyright: ignore[reportAttributeAccessIssue]
+    made_up.main = raise_in("hal.servo.servo", KeyboardInterrupt())  # pyright: ignore[reportAttributeAccessIssue]
     assert cli.main(["made-up"]) == 130
 
 

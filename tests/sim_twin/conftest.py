@@ -2,8 +2,8 @@
 
 import pytest
 
-from sim_twin.scene import SceneConfig
-from sim_twin.world import World
+from sim_twin.model.scene import SceneConfig
+from sim_twin.model.world import World
 
 
 @pytest.fixture(scope="session")

@@ -4,18 +4,18 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from hal import z1
-from hal.arm import Arm
-from hal.camera import Camera
-from hal.clock import ManualClock, WallClock
-from hal.errors import HalTimeoutError, NotConnectedError
-from hal.messages import ArmSetpoint, RgbdFrame
+from hal.base import z1
+from hal.base.arm import Arm
+from hal.base.camera import Camera
+from hal.base.clock import ManualClock, WallClock
+from hal.base.errors import HalTimeoutError, NotConnectedError
+from hal.base.messages import ArmSetpoint, RgbdFrame
 from hal.registry import ARMS, CAMERAS
 from hal.rig import RIGS, Rig
 from sim_twin.backends import TwinArm, TwinCamera, make_rig
 from sim_twin.clock import TwinClock
-from sim_twin.scene import SceneConfig
-from sim_twin.world import World
+from sim_twin.model.scene import SceneConfig
+from sim_twin.model.world import World
 
 
 @pytest.fixture

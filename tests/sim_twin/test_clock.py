@@ -1,9 +1,9 @@
 import pytest
 
-from hal.z1 import CONTROL_PERIOD_S
+from hal.base.z1 import CONTROL_PERIOD_S
 from sim_twin.clock import TwinClock
-from sim_twin.scene import SceneConfig
-from sim_twin.world import World
+from sim_twin.model.scene import SceneConfig
+from sim_twin.model.world import World
 
 
 def test_sleeping_steps_the_world_and_calls_every_tick_first() -> None:

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from z1_runtime.config import ConfigError, RuntimeConfig, load_config, save_config, with_generator
+from hal.base.errors import ConfigError
+from z1_runtime.config import RuntimeConfig, load_config, save_config, with_generator
 
 
 def test_without_a_file_the_defaults_are_in_force() -> None:

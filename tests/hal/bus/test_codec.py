@@ -11,10 +11,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import hal.messages
-from hal.bus.codec import MAX_BYTES, Hello, decode, decode_text, encode, encode_into
-from hal.errors import InvalidMessageError
-from hal.messages import (
+import hal.base.messages
+from hal.base.errors import InvalidMessageError
+from hal.base.messages import (
     ArmSetpoint,
     ArmState,
     Intrinsics,
@@ -24,6 +23,7 @@ from hal.messages import (
     ServoStatus,
     TrajectoryChunk,
 )
+from hal.bus.codec import MAX_BYTES, Hello, decode, decode_text, encode, encode_into
 
 RNG = np.random.default_rng(3)
 INTRINSICS = Intrinsics(width=6, height=4, fx=380.5, fy=381.0, cx=2.5, cy=1.75)
@@ -99,7 +99,9 @@ def _with(sample: object, **changes: object) -> bytes:
 
 
 def test_there_is_a_sample_of_every_message_type():
-    types = {kind for _, kind in inspect.getmembers(hal.messages, inspect.isclass) if dataclasses.is_dataclass(kind)}
+    types = {
+        kind for _, kind in inspect.getmembers(hal.base.messages, inspect.isclass) if dataclasses.is_dataclass(kind)
+    }
     assert types | {Hello} == {type(sample) for sample in SAMPLES}
 
 

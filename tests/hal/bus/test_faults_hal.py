@@ -6,27 +6,27 @@ import signal
 
 import numpy as np
 import pytest
-from conftest import end_processes, free_config, moving, set_off, start_python, wait_until
-from faults_table import FaultsTable
 
-from hal import z1
+from hal.base import z1
+from hal.base.errors import HalTimeoutError
 from hal.bus.client import RemoteArm
-from hal.errors import HalTimeoutError
-from sim_twin.controlled_world import ControlledWorld
-from sim_twin.scene import SceneConfig
-from sim_twin.wire_config import WireConfig
-from sim_twin.wire_rig import free_ports
-from sim_twin.wire_server import WireServer
-from sim_twin.world import World
+from sim_twin.controller.controlled_world import ControlledWorld
+from sim_twin.drop_in.config import WireConfig
+from sim_twin.drop_in.rig import free_ports
+from sim_twin.drop_in.udp_server import WireServer
+from sim_twin.model.scene import SceneConfig
+from sim_twin.model.world import World
+from tests.support.bus_hal import end_processes, free_config, moving, set_off, start_python, wait_until
+from tests.support.faults_table import FaultsTable
 
 SERVE = """
 import sys
 from threading import Event
 from hal.backends.replay_camera import ReplayCamera
-from hal.backends.z1_arm import Z1Arm
-from hal.backends.z1_config import Z1ArmConfig
+from hal.backends.z1.arm import Z1Arm
+from hal.backends.z1.config import Z1ArmConfig
 from hal.bus.session import BusConfig
-from hal.clock import WallClock
+from hal.base.clock import WallClock
 from hal.process import serve
 from hal.rig import Rig
 port, command_port, state_port = map(int, sys.argv[1:])

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import pytest
-from conftest import free_config, wait_until
 
+from hal.base.clock import WallClock
+from hal.base.errors import HalTimeoutError
+from hal.base.messages import ServoMode
 from hal.bus.health import describe_health, wait_for_health
-from hal.clock import WallClock
-from hal.errors import HalTimeoutError
-from hal.messages import ServoMode
+from tests.support.bus_hal import free_config, wait_until
 
 
 def test_the_health_of_a_servo_is_what_its_thread_measured(hal, remote_arm):

@@ -9,10 +9,20 @@ from threading import Event, Thread
 import numpy as np
 import pytest
 import zenoh
-from conftest import moving, slow_motion, wait_until
-from faults_table import FaultsTable, describe
 
-from hal.arm import ServoedArm
+from hal.base.arm import ServoedArm
+from hal.base.camera import Camera
+from hal.base.clock import WallClock
+from hal.base.errors import (
+    CommandRejectedError,
+    HalTimeoutError,
+    InvalidMessageError,
+    LeaseError,
+    NotConnectedError,
+    StoppedError,
+)
+from hal.base.messages import ArmSetpoint, ServoMode, ServoStatus, TrajectoryChunk
+from hal.base.z1 import Q_HOME
 from hal.bus import keys
 from hal.bus.client import RemoteArm, RemoteCamera
 from hal.bus.codec import decode, encode
@@ -20,18 +30,8 @@ from hal.bus.frames import FrameBuffers, FrameStamp
 from hal.bus.service import Listener, as_bytes
 from hal.bus.session import BusConfig, open_session
 from hal.bus.wire_errors import decode_error
-from hal.camera import Camera
-from hal.clock import WallClock
-from hal.errors import (
-    CommandRefusedError,
-    HalTimeoutError,
-    InvalidMessageError,
-    LeaseError,
-    NotConnectedError,
-    StoppedError,
-)
-from hal.messages import ArmSetpoint, ServoMode, ServoStatus, TrajectoryChunk
-from hal.z1 import Q_HOME
+from tests.support.bus_hal import moving, slow_motion, wait_until
+from tests.support.faults_table import FaultsTable, describe
 
 HOME = np.append(Q_HOME, 0.0)
 
@@ -140,7 +140,7 @@ def test_refusals_cross_the_link_as_their_own_classes(remote_arm):
         remote_arm.stream(slow_motion())
     remote_arm.claim()
     far = TrajectoryChunk(trajectory_id=1, t_s=np.array([0.0, 1.0]), q=np.full((2, 7), -0.5), dq=np.zeros((2, 7)))
-    with pytest.raises(CommandRefusedError, match="starts"):
+    with pytest.raises(CommandRejectedError, match="starts"):
         remote_arm.stream(far)
     remote_arm.stop("enough")
     with pytest.raises(StoppedError, match="enough"):

@@ -6,11 +6,11 @@ import os
 from pathlib import Path
 
 import pytest
-from conftest import free_config
 
+from hal.base.errors import HalError, HalTimeoutError
 from hal.bus.client import RemoteArm, RemoteCamera
 from hal.bus.session import BusConfig, open_session
-from hal.errors import HalError, HalTimeoutError
+from tests.support.bus_hal import free_config
 
 
 @pytest.mark.parametrize(

@@ -9,21 +9,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import end_processes, free_config, moving, set_off, start_python, wait_until
-from faults_table import FaultsTable, describe
 
+from hal.base.clock import WallClock
+from hal.base.errors import HalTimeoutError
+from hal.base.messages import ArmSetpoint, ServoMode
 from hal.bus.client import RemoteArm, RemoteCamera
-from hal.clock import WallClock
-from hal.errors import HalTimeoutError
-from hal.messages import ArmSetpoint, ServoMode
+from tests.support.bus_hal import end_processes, free_config, moving, set_off, start_python, wait_until
+from tests.support.faults_table import FaultsTable, describe
 
 BRAKED_WITHIN_S = 0.4
 """The safety requirement: from the death of the commanding process to the arm at rest [s]."""
 
 MOVE = """
 import sys
-sys.path.insert(0, sys.argv[2])
-from conftest import slow_motion
+from tests.support.bus_hal import slow_motion
 from threading import Event
 from hal.bus.client import RemoteArm, BusConfig
 arm = RemoteArm(BusConfig(port=int(sys.argv[1])), owner="mortal")
@@ -106,7 +105,7 @@ def _last_motion_s(sent: list[tuple[float, np.ndarray]]) -> float:
 
 @pytest.mark.faults
 def test_a_killed_runtime_leaves_an_arm_that_brakes_and_holds(hal, recorded, faults_table: FaultsTable):
-    runtime = start_python(MOVE, hal.config.port, Path(__file__).parent)
+    runtime = start_python(MOVE, hal.config.port)
     try:
         wait_until(lambda: moving(hal.servo), 30.0)
         killed_s, q = WallClock().now_s(), hal.arm.read_state().q
@@ -127,7 +126,7 @@ def test_a_killed_runtime_leaves_an_arm_that_brakes_and_holds(hal, recorded, fau
 
 
 def test_a_stop_from_another_process_holds_a_moving_arm_until_rearmed(hal, recorded):
-    runtime = start_python(MOVE, hal.config.port, Path(__file__).parent)
+    runtime = start_python(MOVE, hal.config.port)
     try:
         wait_until(lambda: moving(hal.servo), 30.0)
         with RemoteArm(hal.config, owner="z1 stop") as bystander:

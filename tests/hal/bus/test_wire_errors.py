@@ -9,16 +9,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import hal.errors
+import hal.base.errors
+from hal.base.errors import HalError, LeaseError, NotConnectedError, StoppedError, UnknownBackendError
 from hal.bus.wire_errors import decode_error, encode_error
-from hal.errors import HalError, LeaseError, NotConnectedError, StoppedError, UnknownBackendError
 
 _BUILT = {
     NotConnectedError: NotConnectedError("the arm"),
     StoppedError: StoppedError("knocked over"),
     UnknownBackendError: UnknownBackendError("arm", "z9", ["sim", "mock"]),
 }
-_KINDS = [kind for _, kind in inspect.getmembers(hal.errors, inspect.isclass) if issubclass(kind, HalError)]
+_KINDS = [kind for _, kind in inspect.getmembers(hal.base.errors, inspect.isclass) if issubclass(kind, HalError)]
 
 
 @pytest.mark.parametrize("kind", _KINDS)

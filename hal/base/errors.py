@@ -1,0 +1,144 @@
+"""Every error of the project, rooted at `Z1Error`: the message is for the operator, `code` for programs and tests.
+
+A message reads `<component>: <what failed> (<value>, allowed <range>). <What to do next>.` Packages derive their own
+errors from the classes here; a second, builtin parent lets callers catch what they would expect.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import ClassVar
+
+
+class Z1Error(Exception):
+    """Root of all errors that this project raises on purpose.
+
+    Args:
+        message: for the operator.
+        code: short stable name of what failed; by default the one of the class.
+    """
+
+    default_code: ClassVar[str] = "error"
+
+    def __init__(self, message: str = "", *, code: str | None = None) -> None:
+        super().__init__(message)
+        self.code = code or self.default_code
+
+    def __str__(self) -> str:  # a KeyError parent would show the repr of the sentence
+        return str(self.args[0]) if self.args else ""
+
+    def __reduce__(self) -> tuple[object, ...]:
+        # Subclasses build their message from parts; a copy in another process has the message already.
+        return _rebuild, (type(self), self.args, self.__dict__)
+
+
+def _rebuild(kind: type[Z1Error], args: tuple[object, ...], state: dict[str, object]) -> Z1Error:
+    error = kind.__new__(kind, *args)
+    error.args = args
+    error.__dict__.update(state)
+    return error
+
+
+class UsageError(Z1Error, ValueError):
+    """An option, a file or a configuration of the user's that cannot be used; a command ends with exit code 2."""
+
+    default_code = "usage"
+
+
+class InvalidValueError(UsageError):
+    """An argument or a setting out of its range, or of the wrong shape."""
+
+    default_code = "invalid_value"
+
+
+class ConfigError(UsageError):
+    """A configuration file that cannot be used; the message names the key."""
+
+    default_code = "invalid_config"
+
+
+class OutputExistsError(UsageError, FileExistsError):
+    """A result that would overwrite an earlier one."""
+
+    default_code = "output_exists"
+
+
+class MissingFileError(Z1Error, FileNotFoundError):
+    """A file that a command needs and another command makes."""
+
+    default_code = "missing_file"
+
+
+class HalError(Z1Error):
+    """Root of all errors of the hardware layer."""
+
+    default_code = "hal"
+
+
+class NotConnectedError(HalError, ConnectionError):
+    """A device was used before `connect()` or after `disconnect()`."""
+
+    default_code = "not_connected"
+
+    def __init__(self, device: str) -> None:
+        super().__init__(f"{device} is not connected: call connect() first, or use it in a `with` block.")
+
+
+class HalTimeoutError(HalError, TimeoutError):
+    """A device or the HAL process did not answer in time."""
+
+    default_code = "timeout"
+
+
+class UnknownBackendError(HalError, UsageError, KeyError):
+    """A backend name that is not registered."""
+
+    default_code = "unknown_backend"
+
+    def __init__(self, kind: str, name: str, known: Iterable[str]) -> None:
+        super().__init__(f"there is no {kind} backend {name!r}; known: {', '.join(sorted(known))}.")
+
+
+class InvalidMessageError(HalError, ValueError):
+    """A message whose fields have the wrong shape, type, or values that are not finite."""
+
+    default_code = "invalid_message"
+
+
+class CommandRejectedError(HalError, RuntimeError):
+    """The servo rejects this command; the arm continues its present motion."""
+
+    default_code = "command_rejected"
+
+
+class StoppedError(CommandRejectedError):
+    """The stop is latched: nothing moves until the operator re-arms."""
+
+    default_code = "stopped"
+
+    def __init__(self, reason: str) -> None:
+        super().__init__(f"the arm is stopped ({reason}); look at it, then re-arm with `./z1 rearm`.")
+
+
+class GuardError(CommandRejectedError):
+    """The command leaves the workspace, goes below the table, or into the arm itself."""
+
+    default_code = "guard"
+
+
+class LeaseError(CommandRejectedError):
+    """Another process owns the command lease, or this one has lost it."""
+
+    default_code = "lease"
+
+
+class SdkMissingError(HalError, ImportError):
+    """A vendor's library that a backend needs cannot be imported here."""
+
+    default_code = "sdk_missing"
+
+
+class CameraError(HalError, RuntimeError):
+    """The camera delivered something that cannot be used."""
+
+    default_code = "camera"

@@ -1,0 +1,232 @@
+"""Everything that crosses a boundary: frozen, stamped, SI, with arrays nobody can change afterwards.
+
+Poses are `T_parent_child` with `p_parent = T_parent_child @ p_child`. Joint vectors are in `hal.base.z1.JOINT_NAMES`
+order, six arm joints and then the gripper. Stamps are seconds of the clock of the process that made the message.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from enum import Enum
+from typing import Any
+
+import numpy as np
+
+from hal.base.errors import InvalidMessageError
+from hal.base.z1 import N_JOINTS
+
+
+def frozen_array(value: Any, dtype: Any, shape: tuple[int | None, ...], name: str) -> np.ndarray:
+    """Return a read-only copy of `value` as an array of `dtype`, checked against `shape` (None = any length).
+
+    Raises:
+        InvalidMessageError: wrong shape, or a float that is not finite.
+    """
+    array = np.array(value, dtype=dtype)
+    wrong = array.ndim != len(shape) or any(
+        want is not None and want != have for want, have in zip(shape, array.shape, strict=True)
+    )
+    if wrong:
+        raise InvalidMessageError(f"{name} has shape {array.shape}; allowed is {shape} (None = any length).")
+    if array.dtype.kind == "f" and array.size and not np.isfinite(array).all():
+        raise InvalidMessageError(f"{name} holds values that are not finite: {array[~np.isfinite(array)][:3]}.")
+    array.setflags(write=False)
+    return array
+
+
+def _freeze(message: Any, **arrays: tuple[Any, tuple[int | None, ...]]) -> None:
+    for name, (dtype, shape) in arrays.items():
+        value = getattr(message, name)
+        object.__setattr__(message, name, frozen_array(value, dtype, shape, f"{type(message).__name__}.{name}"))
+    for field in fields(message):
+        value = getattr(message, field.name)
+        if isinstance(value, float) and not np.isfinite(value):
+            raise InvalidMessageError(f"{type(message).__name__}.{field.name} is {value}; it must be finite.")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Intrinsics:
+    """A pinhole camera, optical convention (x right, y down, z forward)."""
+
+    width: int
+    """Image width [px]."""
+    height: int
+    """Image height [px]."""
+    fx: float
+    """Focal length along x [px]."""
+    fy: float
+    """Focal length along y [px]."""
+    cx: float
+    """Principal point, column [px]; the centre of pixel (0, 0) is at 0.0."""
+    cy: float
+    """Principal point, row [px]."""
+
+    @property
+    def K(self) -> np.ndarray:
+        """Camera matrix (3, 3)."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RgbdFrame:
+    """One exposure: colour and depth of the same instant, depth aligned to colour pixel by pixel."""
+
+    colour: np.ndarray
+    """(H, W, 3) uint8, RGB."""
+    depth_m: np.ndarray
+    """(H, W) float32 distance along the optical axis [m]; 0 = no measurement."""
+    intrinsics: Intrinsics
+    """Of both images."""
+    stamp_s: float
+    """Mid-exposure time [s]."""
+    sequence: int
+    """Counts up by one a frame; a gap means lost frames."""
+    serial: str = ""
+    """Serial number of the camera, by which its calibration is found; empty where it tells none."""
+    truth_mask: np.ndarray | None = None
+    """(H, W) bool, the target object's pixels. Only the twin fills it, for evaluation only."""
+
+    def __post_init__(self) -> None:
+        size = (self.intrinsics.height, self.intrinsics.width)
+        _freeze(self, colour=(np.uint8, (*size, 3)), depth_m=(np.float32, size))
+        if self.truth_mask is not None:
+            _freeze(self, truth_mask=(np.bool_, size))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ArmState:
+    """What the arm measures."""
+
+    stamp_s: float
+    """Measurement time [s]."""
+    q: np.ndarray
+    """(7,) joint positions [rad]."""
+    dq: np.ndarray
+    """(7,) joint velocities [rad/s]."""
+    tau: np.ndarray
+    """(7,) joint torques applied by the motors [Nm]."""
+    faults: tuple[str, ...] = ()
+    """Faults the arm reports at this moment, in words; empty when healthy."""
+
+    def __post_init__(self) -> None:
+        _freeze(self, q=(float, (N_JOINTS,)), dq=(float, (N_JOINTS,)), tau=(float, (N_JOINTS,)))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ArmSetpoint:
+    """Where the arm shall be at the next tick."""
+
+    q: np.ndarray
+    """(7,) joint positions [rad]."""
+    dq: np.ndarray
+    """(7,) joint velocities [rad/s]."""
+
+    def __post_init__(self) -> None:
+        _freeze(self, q=(float, (N_JOINTS,)), dq=(float, (N_JOINTS,)))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class TrajectoryChunk:
+    """A piece of a joint trajectory, sent about 0.2 s before it is due.
+
+    Trajectory time starts at 0 with the first point of the first chunk; the servo starts that clock when it takes
+    the chunk and holds it when it is late, so sender and servo need no common clock. A chunk of a new trajectory
+    replaces what is left of the old one.
+    """
+
+    trajectory_id: int
+    """Which trajectory this belongs to; a new one is greater than all before it."""
+    t_s: np.ndarray
+    """(N,) trajectory times [s], rising; the first continues where the last chunk ended."""
+    q: np.ndarray
+    """(N, 7) joint positions [rad]."""
+    dq: np.ndarray
+    """(N, 7) joint velocities [rad/s]."""
+    final: bool = False
+    """True on the last chunk: the servo then holds its last point instead of calling the sender lost."""
+
+    def __post_init__(self) -> None:
+        n = len(np.atleast_1d(self.t_s))
+        _freeze(self, t_s=(float, (n,)), q=(float, (n, N_JOINTS)), dq=(float, (n, N_JOINTS)))
+        if n == 0 or (np.diff(self.t_s) <= 0).any():
+            raise InvalidMessageError("TrajectoryChunk.t_s must hold at least one time and rise strictly.")
+
+
+class ServoMode(Enum):
+    """What the servo is doing."""
+
+    HOLDING = "holding"
+    """Keeps the last commanded position."""
+    TRACKING = "tracking"
+    """Follows a trajectory."""
+    BRAKING = "braking"
+    """Slows down within the limits, then holds."""
+    STOPPED = "stopped"
+    """Holds, and takes no command until it is re-armed."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ServoStatus:
+    """The servo's own account of itself, published beside the arm's state."""
+
+    stamp_s: float
+    """When this was written [s]."""
+    mode: ServoMode
+    """What it is doing."""
+    reason: str
+    """Why it brakes, is stopped, or dropped the last trajectory; empty when all is well."""
+    owner: str
+    """Who holds the command lease; empty when nobody does."""
+    trajectory_id: int
+    """The last trajectory taken; 0 before the first."""
+    trajectory_time_s: float
+    """How far that trajectory has been played [s]."""
+    buffered_s: float
+    """How much of it waits to be played [s]."""
+    finished: bool
+    """True when that trajectory was played to its end (not when it was dropped)."""
+    q_command: np.ndarray
+    """(7,) last setpoint sent to the arm, after limits [rad]."""
+    ticks: int
+    """Cycles since the start."""
+    overruns: int
+    """Cycles that began more than half a period late."""
+    period_ms_p50: float
+    """Median of the last measured periods [ms]; 0 while unmeasured (lock-step)."""
+    period_ms_p999: float
+    """99.9th percentile of the same [ms]."""
+
+    def __post_init__(self) -> None:
+        _freeze(self, q_command=(float, (N_JOINTS,)))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ServoHealth:
+    """How well the servo does its work, published once a second; all figures are measured."""
+
+    stamp_s: float
+    """When this was written [s]."""
+    mode: ServoMode
+    """What it is doing."""
+    faults: tuple[str, ...]
+    """Why it is stopped, or else what the arm reports; empty when all is well."""
+    rate_hz: float
+    """Cycles a second, of the last minute; this and the periods are 0 while unmeasured (lock-step)."""
+    period_ms_p50: float
+    """Median of the last minute's periods [ms]."""
+    period_ms_p99: float
+    """99th percentile of the same [ms]."""
+    period_ms_p999: float
+    """99.9th percentile [ms]."""
+    period_ms_max: float
+    """Longest [ms]."""
+    ticks: int
+    """Cycles since the start."""
+    overruns: int
+    """Cycles that began more than half a period late."""
+    owner: str
+    """Who holds the command lease; empty when nobody does."""
+    command_age_s: float
+    """Since the owner was last heard, by a command or its heartbeat [s]; 0 while nobody holds the lease."""
+    real_time: tuple[str, ...]
+    """What the machine granted the servo's thread, such as SCHED_FIFO; empty = it shares its core as any other."""

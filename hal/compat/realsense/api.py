@@ -1,0 +1,271 @@
+"""The classes of pyrealsense2 that must know of twins; everything else is librealsense's own.
+
+Names and arguments are librealsense's. Facts about the native classes that shape this file: `pipeline.set_device` gives
+a pipeline a device for good and makes it deaf to serial numbers and files in a `config`; a `context` cannot be taught a
+device from Python. The texts of errors are the library's. In lock-step, frames come to those who wait for a pipeline or
+a queue it was started with; callbacks and syncers need free run.
+"""
+
+from __future__ import annotations
+
+import threading
+from contextlib import nullcontext
+
+from hal.compat.realsense import port
+from hal.compat.realsense.device import TwinDevice
+from hal.compat.realsense.library import native as rs
+
+_NO_DEVICE = "No device connected"
+
+
+class config(rs.config):
+    """Remembers what the native one does not tell."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.wanted_serial: str | None = None
+        self.is_file = False
+        self.wants_all = False
+
+    def enable_device(self, serial: str) -> None:
+        super().enable_device(serial)
+        self.wanted_serial = serial
+
+    def enable_device_from_file(self, file_name: str, repeat_playback: bool = True) -> None:
+        super().enable_device_from_file(file_name, repeat_playback)
+        self.is_file = True
+
+    def enable_all_streams(self) -> None:
+        super().enable_all_streams()
+        self.wants_all = True
+
+    def disable_all_streams(self) -> None:
+        super().disable_all_streams()
+        self.wants_all = False
+
+    def resolve(self, p: pipeline_wrapper) -> rs.pipeline_profile:
+        return super().resolve(rs.pipeline_wrapper(p.pipeline.prepare(self)))
+
+    def can_resolve(self, p: pipeline_wrapper) -> bool:
+        try:
+            return super().can_resolve(rs.pipeline_wrapper(p.pipeline.prepare(self)))
+        except RuntimeError:
+            return False
+
+    def name_all_streams(self) -> None:
+        """Name each stream of `enable_all_streams`, which finds none on a `software_device`."""
+        if not self.wants_all:
+            return
+        super().disable_all_streams()
+        super().enable_stream(rs.stream.depth)
+        super().enable_stream(rs.stream.color)
+        for imager in (1, 2):
+            super().enable_stream(rs.stream.infrared, imager)
+
+
+class pipeline_wrapper(rs.pipeline_wrapper):
+    """Remembers its pipeline."""
+
+    def __init__(self, p: pipeline) -> None:
+        super().__init__(p)
+        self.pipeline = p
+
+
+class pipeline(rs.pipeline):
+    """Streams from a twin, where one is plugged in, from a real camera otherwise, and from files."""
+
+    def __init__(self, ctx: rs.context | None = None) -> None:
+        super().__init__(*() if ctx is None else (ctx,))
+        self._engine: rs.pipeline = self  # which native pipeline streams
+        self._twin: TwinDevice | None = None
+        self._had_twin = False
+        self._streams = False
+
+    def start(self, *args, **kwargs) -> rs.pipeline_profile:
+        options = [*args, *kwargs.values()]
+        wish = next((option for option in options if isinstance(option, rs.config)), None)
+        queue = next((option for option in options if isinstance(option, frame_queue)), None)
+        if not self._streams:  # else the library says what is wrong
+            self._engine = self.prepare(wish)
+            self._twin = None if self._engine is not self else _twin_for(wish)
+        twin = self._twin
+        if twin is not None and twin.source.lockstep and queue is None and len(options) > (wish is not None):
+            raise RuntimeError(
+                "a twin in lock-step makes frames when they are waited for, so nothing would call a callback; "
+                "wait for frames, start with a hal.compat.realsense.frame_queue, or run the twin on the wall's clock."
+            )
+        with self._guard():
+            profile = rs.pipeline.start(self._engine, *args, **kwargs)
+        self._streams = True
+        if twin is not None:
+            twin.restart()
+            if queue is not None:
+                queue.twin = twin
+        return profile
+
+    def stop(self) -> None:
+        with self._guard():
+            rs.pipeline.stop(self._engine)
+        self._streams = False
+
+    def get_active_profile(self) -> rs.pipeline_profile:
+        return rs.pipeline.get_active_profile(self._engine)
+
+    def wait_for_frames(self, timeout_ms: int = 5000) -> rs.composite_frame:
+        if self._lockstep():
+            frames = self._pull(timeout_ms)
+            if frames:
+                return frames
+            raise RuntimeError(self._why_late(timeout_ms))
+        try:
+            return rs.pipeline.wait_for_frames(self._engine, timeout_ms)
+        except RuntimeError as error:
+            if self._streams and self._twin is not None and not self._twin.present:
+                raise RuntimeError(self._why_late(timeout_ms)) from error
+            raise
+
+    def try_wait_for_frames(self, timeout_ms: int = 5000) -> tuple[bool, rs.composite_frame]:
+        if self._lockstep():
+            frames = self._pull(timeout_ms)
+            return bool(frames), frames
+        return rs.pipeline.try_wait_for_frames(self._engine, timeout_ms)
+
+    def poll_for_frames(self) -> rs.composite_frame:
+        return self._pull(1000) if self._lockstep() else rs.pipeline.poll_for_frames(self._engine)
+
+    def prepare(self, wish: rs.config | None) -> rs.pipeline:
+        """Return the native pipeline that will do what `wish` says, with the right device.
+
+        Raises:
+            RuntimeError: the camera asked for is not there.
+        """
+        if isinstance(wish, config) and wish.is_file:
+            return rs.pipeline()
+        twin = _twin_for(wish)
+        if twin is not None:
+            if isinstance(wish, config):
+                wish.name_all_streams()
+            self.set_device(twin.handle)
+            self._had_twin = True
+        elif self._had_twin:
+            raise RuntimeError(_NO_DEVICE)
+        return self
+
+    def _lockstep(self) -> bool:
+        return self._streams and self._twin is not None and self._twin.source.lockstep
+
+    def _pull(self, timeout_ms: int) -> rs.composite_frame:
+        """Let the twin go on until it has frames or the time is over; return them, or an empty set."""
+        assert self._twin is not None
+        clock = self._twin.source.clock
+        end_s = clock.now_s() + 1e-3 * timeout_ms
+        frames = rs.pipeline.poll_for_frames(self._engine)
+        while not frames and clock.now_s() < end_s:
+            self._twin.step(end_s - clock.now_s())
+            frames = rs.pipeline.poll_for_frames(self._engine)
+        return frames
+
+    def _why_late(self, timeout_ms: int) -> str:
+        if self._twin is not None and not self._twin.present:
+            return f"Device disconnected. Failed to reconnect: {_NO_DEVICE}{timeout_ms}"
+        return f"Frame didn't arrive within {timeout_ms}"
+
+    def _guard(self) -> threading.RLock | nullcontext:
+        return self._twin.lock if self._twin is not None else nullcontext()
+
+
+class frame_queue(rs.frame_queue):
+    """In lock-step, waiting for a frame makes it."""
+
+    def __init__(self, capacity: int = 1, keep_frames: bool = False) -> None:
+        super().__init__(capacity, keep_frames)
+        self.twin: TwinDevice | None = None
+
+    def wait_for_frame(self, timeout_ms: int = 5000) -> rs.frame:
+        return super().wait_for_frame(self._pull(timeout_ms))
+
+    def try_wait_for_frame(self, timeout_ms: int = 5000) -> tuple[bool, rs.frame]:
+        return super().try_wait_for_frame(self._pull(timeout_ms))
+
+    def poll_for_frame(self) -> rs.frame:
+        self._pull(1000)
+        return super().poll_for_frame()
+
+    def _pull(self, timeout_ms: int) -> int:
+        """Let a twin in lock-step go on until it has a frame or the time is over; return what is left to wait [ms]."""
+        if self.twin is None or not self.twin.source.lockstep:
+            return timeout_ms
+        clock = self.twin.source.clock
+        end_s = clock.now_s() + 1e-3 * timeout_ms
+        while self.size() == 0 and clock.now_s() < end_s:
+            self.twin.step(end_s - clock.now_s())
+        return 1
+
+
+class context(rs.context):
+    """Finds the twins that are plugged in, or else the real cameras."""
+
+    def query_devices(self, mask: int | None = None) -> rs.device_list:
+        if port.twins():
+            return device_list(twin.handle for twin in port.twins() if twin.present)
+        return super().query_devices(*() if mask is None else (mask,))
+
+    def query_all_sensors(self) -> list[rs.sensor]:
+        if port.twins():
+            return [sensor for device in self.query_devices() for sensor in device.query_sensors()]
+        return super().query_all_sensors()
+
+    def set_devices_changed_callback(self, callback) -> None:
+        if port.twins():
+            port.watch(callback)
+        super().set_devices_changed_callback(callback)
+
+    @property
+    def devices(self) -> rs.device_list:
+        return self.query_devices()
+
+    @property
+    def sensors(self) -> list[rs.sensor]:
+        return self.query_all_sensors()
+
+
+class device_list(list):
+    """Acts as the library's own, which cannot be made from Python."""
+
+    def size(self) -> int:
+        return len(self)
+
+    def front(self) -> rs.device:
+        return self._end(0)
+
+    def back(self) -> rs.device:
+        return self._end(-1)
+
+    def contains(self, device: rs.device) -> bool:
+        return device in self
+
+    def __getitem__(self, index):
+        try:
+            return super().__getitem__(index)
+        except IndexError:
+            raise IndexError from None
+
+    def _end(self, index: int) -> rs.device:
+        if not self:
+            raise RuntimeError('out of range value for argument "index"')
+        return self[index]
+
+
+def _twin_for(wish: rs.config | None) -> TwinDevice | None:
+    """Return the twin that `wish` names, or the first; None when none is plugged in.
+
+    Raises:
+        RuntimeError: that one is not there.
+    """
+    if not port.twins():
+        return None
+    serial = getattr(wish, "wanted_serial", None)
+    for twin in port.twins():
+        if twin.present and serial in (None, twin.serial):
+            return twin
+    raise RuntimeError(_NO_DEVICE)

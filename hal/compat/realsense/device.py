@@ -1,0 +1,209 @@
+"""A D405 for librealsense whose frames come from a `FrameSource`: one `software_device` with everything on it."""
+
+from __future__ import annotations
+
+import logging
+import math
+import threading
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+
+from hal.base import d405
+from hal.base.clock import unix_offset_s
+from hal.base.d405 import Exposure, FrameSource, Look
+from hal.compat.realsense.description import FORMATS, describe
+from hal.compat.realsense.library import native as rs
+
+logger = logging.getLogger(__name__)
+
+SERIAL = "000000000405"
+"""Of a twin, unless told otherwise: of the right length, and no real unit's."""
+_IDLE_S = 1.0 / 30.0
+
+
+class TwinDevice:
+    """One twin on librealsense's side: its identity, profiles and options, and the way of a frame into the library.
+
+    Args:
+        source: the optics.
+        serial: by which programs choose it.
+
+    In free run a thread of its own makes the exposures; `start` begins and `close` ends it.
+    """
+
+    def __init__(self, source: FrameSource, serial: str = SERIAL) -> None:
+        self.source, self.serial = source, serial
+        self.handle = rs.software_device()
+        self.lock = threading.RLock()
+        """Held while frames go into the library; starting and stopping streams holds it too."""
+        self.on_presence: Callable[[bool], None] = lambda present: None
+        """Called when the device leaves or returns."""
+        self._sensor = describe(self.handle, serial, source.calibration)
+        self._first_s: float | None = None
+        self._streams: list[tuple] = []
+        self._away_until_s = -math.inf
+        self._was_present = True
+        self._ended = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    @property
+    def present(self) -> bool:
+        """False while the cable is out or a reset is under way, and once unplugged."""
+        return not self._ended.is_set() and self.source.attached and self.source.clock.now_s() >= self._away_until_s
+
+    def start(self) -> None:
+        """Begin to deliver, unless frames are made only on demand."""
+        if not self.source.lockstep and self._thread is None:
+            self._thread = threading.Thread(target=self._run, name=f"twin D405 {self.serial}", daemon=True)
+            self._thread.start()
+
+    def close(self) -> None:
+        """Deliver no more."""
+        self._ended.set()
+        if self._thread is not None and self._thread is not threading.current_thread():
+            self._thread.join()
+        self._thread = None
+
+    def restart(self) -> None:
+        """Streams were started: instants and frame numbers begin anew."""
+        self._first_s = None
+
+    def reset(self) -> None:
+        """Do what `hardware_reset()` does: leave the bus for a while."""
+        self._away_until_s = self.source.clock.now_s() + d405.RESET_S
+        self.source.reset()
+        self._tell_presence()
+
+    def step(self, timeout_s: float) -> None:
+        """Lock-step: let the clock run to the next instant, or for `timeout_s` [s] if that is nearer, and deliver."""
+        clock = self.source.clock
+        now_s = clock.now_s()
+        number, due_s = self._next_instant(now_s)
+        if due_s > now_s + timeout_s:
+            clock.sleep_until(now_s + timeout_s)
+        else:
+            clock.sleep_until(due_s)
+            self._deliver(number)
+        self._tell_presence()
+
+    def _run(self) -> None:
+        clock = self.source.clock
+        try:
+            while not self._ended.is_set():
+                number, due_s = self._next_instant(clock.now_s())
+                clock.sleep_until(due_s)
+                self._deliver(number)
+                self._tell_presence()
+        except Exception:
+            logger.exception("the optics of the twin %s failed; it has left the bus", self.serial)
+            self._ended.set()
+            self._tell_presence()
+
+    def _tell_presence(self) -> None:
+        present = self.present
+        if present != self._was_present:
+            self._was_present = present
+            self.on_presence(present)
+
+    def _next_instant(self, now_s: float) -> tuple[int, float]:
+        """Return number and time [s] of the next frame; without streams, of the next look whether there are some."""
+        profiles = self._active()
+        streams = [_key(profile) for profile in profiles]
+        if self._first_s is None or streams != self._streams:
+            self._first_s, self._streams = now_s, streams
+        if not streams:
+            return 0, now_s + _IDLE_S
+        rate_hz = streams[0][-1]
+        # The tolerance keeps an instant that rounding puts a hair after its own step from being seen twice.
+        number = math.floor((now_s - self._first_s) * rate_hz + 1e-6) + 1
+        return number, self._first_s + number / rate_hz
+
+    def _deliver(self, number: int) -> None:
+        profiles = self._active()
+        if not profiles or not self.present:
+            return
+        exposure = self.source.expose(self._look(number, profiles))
+        if exposure is None:
+            return
+        with self.lock:
+            active = {_key(profile) for profile in self._active()}
+            for profile in profiles:
+                if _key(profile) in active:  # else it was stopped while the picture was made
+                    self._set_metadata(exposure)
+                    self._inject(profile, exposure)
+
+    def _active(self) -> list:
+        return [profile.as_video_stream_profile() for profile in self._sensor.get_active_streams()]
+
+    def _look(self, number: int, profiles: list) -> Look:
+        wanted = {(p.stream_type(), p.stream_index()) for p in profiles}
+        automatic = bool(self._sensor.get_option(rs.option.enable_auto_exposure))
+        brightness = 1.0
+        if not automatic:
+            brightness = self._sensor.get_option(rs.option.exposure) / d405.EXPOSURE_US[-1]
+            brightness *= self._sensor.get_option(rs.option.gain) / d405.GAIN[-1]
+        return Look(
+            number=number,
+            width=profiles[0].width(),
+            height=profiles[0].height(),
+            depth=(rs.stream.depth, 0) in wanted,
+            colour=(rs.stream.color, 0) in wanted,
+            left=bool(wanted & {(rs.stream.infrared, 0), (rs.stream.infrared, 1)}),
+            right=(rs.stream.infrared, 2) in wanted,
+            brightness=brightness,
+        )
+
+    def _set_metadata(self, exposure: Exposure) -> None:
+        offset_s = unix_offset_s(self.source.clock)
+        value, sensor = rs.frame_metadata_value, self._sensor
+        sensor.set_metadata(value.frame_counter, exposure.number)
+        sensor.set_metadata(value.frame_timestamp, round(1e6 * exposure.stamp_s))
+        sensor.set_metadata(value.sensor_timestamp, round(1e6 * exposure.stamp_s))
+        arrival_ms = round(1e3 * (self.source.clock.now_s() + offset_s))
+        sensor.set_metadata(value.time_of_arrival, arrival_ms)
+        sensor.set_metadata(value.backend_timestamp, arrival_ms)
+        sensor.set_metadata(value.actual_exposure, round(sensor.get_option(rs.option.exposure)))
+        sensor.set_metadata(value.gain_level, round(sensor.get_option(rs.option.gain)))
+        sensor.set_metadata(value.auto_exposure, round(sensor.get_option(rs.option.enable_auto_exposure)))
+
+    def _inject(self, profile, exposure: Exposure) -> None:
+        stream, index = profile.stream_type(), profile.stream_index()
+        bytes_per_pixel, conversion = FORMATS[stream, index][profile.format()]
+        size = (profile.height(), profile.width())
+        if stream == rs.stream.depth:
+            name, shape, dtype = "depth", size, np.uint16
+        else:
+            name = "colour" if stream == rs.stream.color else "right" if index == 2 else "left"
+            shape, dtype = (*size, 3), np.uint8
+        image = getattr(exposure, name)
+        if image is None:
+            return
+        image = _checked(image, shape, dtype, name)
+        if conversion is not None:
+            image = cv2.cvtColor(image, conversion)
+        # A new one for every frame: the library owns what it was given, and giving it twice frees it twice.
+        frame = rs.software_video_frame()
+        frame.pixels = image
+        frame.stride, frame.bpp = size[1] * bytes_per_pixel, bytes_per_pixel
+        frame.timestamp = 1e3 * (exposure.stamp_s + unix_offset_s(self.source.clock))
+        frame.domain = rs.timestamp_domain.global_time
+        frame.frame_number = exposure.number
+        frame.profile = profile
+        if stream == rs.stream.depth:
+            frame.depth_units = d405.DEPTH_UNIT_M
+        self._sensor.on_video_frame(frame)
+
+
+def _key(profile) -> tuple:
+    size = (profile.width(), profile.height())
+    return (profile.stream_type(), profile.stream_index(), profile.format(), *size, profile.fps())
+
+
+def _checked(image: np.ndarray, shape: tuple[int, ...], dtype: type, name: str) -> np.ndarray:
+    """Return the image in one piece; the library copies its bytes without looking at shape, type or strides."""
+    if image.shape != shape or image.dtype != dtype:
+        seen, wanted = f"{image.dtype} {image.shape}", f"{np.dtype(dtype).name} {shape}"
+        raise ValueError(f"the frame source gave {seen} for {name}; wanted is {wanted}.")
+    return np.ascontiguousarray(image)

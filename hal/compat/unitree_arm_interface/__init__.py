@@ -1,0 +1,19 @@
+"""`unitree_arm_interface` without the vendor's library: its scripts run on any Python, on the arm or on the twin.
+
+`import hal.compat.unitree_arm_interface as unitree_arm_interface` in a script of one's own; `with masquerade():` or
+`install()` before one that says `import unitree_arm_interface` and must stay as it is.
+"""
+
+from hal.compat.unitree_arm_interface.arm import ArmInterface as ArmInterface
+from hal.compat.unitree_arm_interface.lowlevel import RECVSTATE_LENGTH as RECVSTATE_LENGTH
+from hal.compat.unitree_arm_interface.lowlevel import ArmFSMState as ArmFSMState
+from hal.compat.unitree_arm_interface.lowlevel import BlockYN as BlockYN
+from hal.compat.unitree_arm_interface.lowlevel import CtrlComponents as CtrlComponents
+from hal.compat.unitree_arm_interface.lowlevel import LowlevelCmd as LowlevelCmd
+from hal.compat.unitree_arm_interface.lowlevel import LowlevelState as LowlevelState
+from hal.compat.unitree_arm_interface.lowlevel import UDPPort as UDPPort
+from hal.compat.unitree_arm_interface.model import Z1Model as Z1Model
+from hal.compat.unitree_arm_interface.model import homoToPosture as homoToPosture
+from hal.compat.unitree_arm_interface.model import postureToHomo as postureToHomo
+from hal.compat.unitree_arm_interface.port import install as install
+from hal.compat.unitree_arm_interface.port import masquerade as masquerade

@@ -1,0 +1,253 @@
+"""Client ↔ z1_ctrl: commands of 147 B to port 8071, states of 208 B back to port 8072.
+
+What the last 140 bytes of a command mean depends on the state that is asked for or, while tracking, on the one the
+controller is in; `Command.joints`, `.trajectory` and `.label` read them when that is known.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from hal.base import z1
+from hal.z1_protocol.records import (
+    JOINT_CMD,
+    JOINT_STATE,
+    KD_SCALE,
+    KP_SCALE,
+    JointCommands,
+    JointStates,
+    WireError,
+    pack_commands,
+    pack_states,
+    unpack_commands,
+    unpack_states,
+)
+from hal.z1_protocol.states import Fsm
+
+COMMAND_PORT = 8071
+"""Bound by the controller."""
+STATE_PORT = 8072
+"""Bound by the client; a second arm has another pair."""
+COMMAND_SIZE = 147
+STATE_SIZE = 208
+
+KP_LOWCMD = np.array([20.0, 30.0, 30.0, 20.0, 15.0, 10.0, 20.0])
+"""(7,) the client's usual gains in LOWCMD, in wire units."""
+KD_LOWCMD = np.full(z1.N_JOINTS, 2000.0)
+"""(7,) the client's usual damping gains in LOWCMD, in wire units."""
+KP_JOINTCTRL = z1.KP / KP_SCALE
+"""(7,) the controller's gains in JOINTCTRL, in wire units."""
+KD_JOINTCTRL = z1.KD / KD_SCALE
+"""(7,) the controller's damping gains in JOINTCTRL, in wire units."""
+KD_PASSIVE = np.array([10.0, 100.0, 300.0, 10.0, 10.0, 10.0, 0.0])
+"""(7,) the controller's damping gains in PASSIVE, where the gains are 0; in wire units."""
+LABELS = {
+    "forward": np.array([0.0, 1.5, -1.0, -0.54, 0.0, 0.0]),
+    "startFlat": np.array([0.0, 0.0, -0.005, -0.074, 0.0, 0.0]),
+}
+"""Saved labels whose joints (6,) are known [rad]; `show_left`, `show_mid` and `show_right` are saved as well."""
+for _constant in (KP_LOWCMD, KD_LOWCMD, KP_JOINTCTRL, KD_JOINTCTRL, KD_PASSIVE, *LABELS.values()):
+    _constant.setflags(write=False)
+
+_HEAD = b"\xfe\xff"
+_COMMAND_HEAD = struct.Struct("<2siB")
+_STATE_HEAD = struct.Struct("<2si")
+_POSE = struct.Struct("<6d")
+_TRAJECTORY = struct.Struct("<i12d3di")
+_BODY_SIZE = COMMAND_SIZE - _COMMAND_HEAD.size
+_JOINTS_AT = _STATE_HEAD.size
+_POSE_AT = _JOINTS_AT + z1.N_JOINTS * JOINT_STATE.itemsize
+_LABEL_SIZE = 10
+_PLAUSIBLE_POSE = 1e2
+_STATES = frozenset(Fsm)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class TrajectoryCommand:
+    """A move of the gripper pivot: roll, pitch, yaw [rad] (R = Rz·Ry·Rx) and x, y, z [m] in the base frame."""
+
+    kind: int = 0
+    """Unused by the controller; may hold garbage."""
+    poses: np.ndarray = field(default_factory=lambda: np.zeros((2, 6)))
+    """(2, 6) the goal; MOVEC passes through the first and ends in the second."""
+    gripper_rad: float = 0.0
+    """Gripper angle at the end [rad]."""
+    max_speed: float = 0.0
+    """Of the joints in MOVEJ [rad/s], of the pivot in MOVEL and MOVEC [m/s]."""
+    stop_time_s: float = 0.0
+    """[s]."""
+    order: int = 0
+    """Number of this piece in SETTRAJ."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Command:
+    """A decoded command; its body is read when it is known what it means."""
+
+    state: Fsm
+    """The state asked for; INVALID keeps the present one."""
+    track: bool
+    """Whether the body is to be followed, in JOINTCTRL and CARTESIAN."""
+    body: bytes
+    """140 bytes."""
+
+    def joints(self) -> JointCommands:
+        """Read the body as seven joints' commands (LOWCMD, and tracking in JOINTCTRL).
+
+        Raises:
+            WireError: a value is not finite.
+        """
+        return unpack_commands(np.frombuffer(self.body, JOINT_CMD))
+
+    def trajectory(self) -> TrajectoryCommand:
+        """Read the body as a move (MOVEJ, MOVEL, MOVEC, SETTRAJ, and tracking in CARTESIAN).
+
+        Raises:
+            WireError: a value is not finite.
+        """
+        kind, *numbers, order = _TRAJECTORY.unpack_from(self.body)
+        values = np.array(numbers)
+        if not np.isfinite(values).all():
+            raise WireError(f"a move holds values that are not finite: {values[~np.isfinite(values)][:3]}.")
+        return TrajectoryCommand(
+            kind=kind,
+            poses=values[:12].reshape(2, 6),
+            gripper_rad=float(values[12]),
+            max_speed=float(values[13]),
+            stop_time_s=float(values[14]),
+            order=order,
+        )
+
+    def label(self) -> str:
+        """Read the body as a label (TOSTATE, SAVESTATE, TEACH, TEACHREPEAT).
+
+        Raises:
+            WireError: not 1 to 10 printable ASCII characters.
+        """
+        name = self.body[:_LABEL_SIZE].split(b"\0", 1)[0]
+        if not name or not all(0x20 < byte < 0x7F for byte in name):
+            raise WireError(f"a label is {name!r}; allowed are 1 to {_LABEL_SIZE} printable ASCII characters.")
+        return name.decode("ascii")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ControllerState:
+    """What the controller answers."""
+
+    state: Fsm
+    """What it is doing."""
+    joints: JointStates
+    """The seven joints; repeated unchanged while the arm board is silent."""
+    pose: np.ndarray
+    """(6,) roll, pitch, yaw [rad] and x, y, z [m] of the gripper pivot in the base frame."""
+
+
+class CommandBuffer:
+    """One command that is written over and over, without making garbage; `data` is what to send."""
+
+    def __init__(self) -> None:
+        self.data = bytearray(COMMAND_SIZE)
+        self.joints = np.frombuffer(self.data, JOINT_CMD, z1.N_JOINTS, offset=_COMMAND_HEAD.size)
+        """Records (7,) of `JOINT_CMD` inside `data`: assign to them."""
+        self.head(Fsm.INVALID, track=False)
+
+    def head(self, state: Fsm, *, track: bool) -> None:
+        """Set what is asked for, and whether the joints are to be tracked."""
+        _COMMAND_HEAD.pack_into(self.data, 0, _HEAD, state, track)
+
+
+def encode_command(
+    state: Fsm, body: JointCommands | TrajectoryCommand | str | None = None, *, track: bool = False
+) -> bytes:
+    """Return a command of 147 B.
+
+    Raises:
+        WireError: a value that is not finite, a label that is too long, not seven joints.
+    """
+    match body:
+        case None:
+            packed = b""
+        case str():
+            packed = _pack_label(body)
+        case JointCommands():
+            packed = pack_commands(body).tobytes()
+        case TrajectoryCommand():
+            packed = _pack_trajectory(body)
+    if len(packed) > _BODY_SIZE:
+        raise WireError(f"a command holds {len(packed)} bytes beside its head; allowed are {_BODY_SIZE}.")
+    return _COMMAND_HEAD.pack(_HEAD, state, track) + packed.ljust(_BODY_SIZE, b"\0")
+
+
+def decode_command(data: bytes | memoryview) -> Command:
+    """Return the command in a datagram.
+
+    Raises:
+        WireError: wrong size, head, state or flag.
+    """
+    _check_size(data, COMMAND_SIZE, "a command")
+    head, state, track = _COMMAND_HEAD.unpack_from(data)
+    _check_head(head, state)
+    if track > 1:
+        raise WireError(f"a command's track flag is {track}; allowed are 0 and 1.")
+    return Command(state=Fsm(state), track=bool(track), body=bytes(data[_COMMAND_HEAD.size :]))
+
+
+def encode_state(state: ControllerState) -> bytes:
+    """Return a state of 208 B.
+
+    Raises:
+        WireError: a value that is not finite, or not seven joints.
+    """
+    if not np.isfinite(state.pose).all():
+        raise WireError(f"the pose {state.pose} must be finite.")
+    joints = pack_states(state.joints).tobytes()
+    data = _STATE_HEAD.pack(_HEAD, state.state) + joints + _POSE.pack(*state.pose)
+    _check_size(data, STATE_SIZE, "a state")
+    return data
+
+
+def decode_state(data: bytes | memoryview) -> ControllerState:
+    """Return the state in a datagram, which is copied.
+
+    Raises:
+        WireError: wrong size, head or state, or a value that no Z1 can have.
+    """
+    _check_size(data, STATE_SIZE, "a state")
+    head, state = _STATE_HEAD.unpack_from(data)
+    _check_head(head, state)
+    pose = np.array(_POSE.unpack_from(data, _POSE_AT))
+    if not (np.abs(pose) <= _PLAUSIBLE_POSE).all():
+        raise WireError(f"the gripper's pose is {pose}; allowed are finite values within ±{_PLAUSIBLE_POSE:g}.")
+    records = np.frombuffer(bytes(data[_JOINTS_AT:_POSE_AT]), JOINT_STATE)
+    return ControllerState(state=Fsm(state), joints=unpack_states(records), pose=pose)
+
+
+def _pack_label(label: str) -> bytes:
+    packed = label.encode("ascii", "replace")
+    if not 1 <= len(packed) <= _LABEL_SIZE or not label.isascii() or not label.isprintable() or " " in label:
+        raise WireError(
+            f"the label {label!r} cannot be sent; allowed are 1 to {_LABEL_SIZE} printable ASCII characters."
+        )
+    return packed
+
+
+def _pack_trajectory(move: TrajectoryCommand) -> bytes:
+    numbers = [*np.asarray(move.poses, dtype=float).ravel(), move.gripper_rad, move.max_speed, move.stop_time_s]
+    if not np.isfinite(numbers).all():
+        raise WireError(f"a move holds values that are not finite: {numbers}.")
+    return _TRAJECTORY.pack(move.kind, *numbers, move.order)
+
+
+def _check_size(data: bytes | memoryview, size: int, what: str) -> None:
+    if len(data) != size:
+        raise WireError(f"{what} has {len(data)} bytes; allowed are {size}.")
+
+
+def _check_head(head: bytes, state: int) -> None:
+    if head != _HEAD:
+        raise WireError(f"a datagram begins with {head.hex()}; allowed is {_HEAD.hex()}.")
+    if state not in _STATES:
+        raise WireError(f"a datagram names state {state}; allowed are 0 to {max(_STATES)}.")

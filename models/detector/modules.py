@@ -1,0 +1,131 @@
+"""Detectors as torch modules: our own weights, or an ultralytics checkpoint; and their export to ONNX, made once."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from models.detector.weights import CAMERA_HW, MAKER, load_detector, tame_ultralytics
+from models.torch_threads import single_threaded_workers
+from models.weights_file import WeightsError, checked_sha256, sha256_of
+
+MODULE_SUFFIXES = (".npz", ".pt")
+"""Files that hold a network's weights; the others hold a graph that a runtime reads."""
+_EXPORT = "v1"
+"""Counts up when what is exported changes: older files are then made anew."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class DetectorModule:
+    """A network with its batch norms folded in."""
+
+    network: Any
+    """DetectionModel of ultralytics; gives (rows, prototypes), or rows alone when it knows no masks."""
+    names: tuple[str, ...]
+    """Classes in the order of the outputs."""
+    input_hw: tuple[int, int]
+    """(H, W) of the images it is shown [px]."""
+
+
+def load_module(path: Path) -> DetectorModule:
+    """Return the detector of a .npz of ours or of a .pt of ultralytics.
+
+    Of a .pt, which is a pickle, only ultralytics' and torch's own classes are made.
+
+    Raises:
+        WeightsError: the file is missing, damaged, or holds no detector that is understood.
+    """
+    network: Any
+    if path.suffix == ".npz":
+        loaded = load_detector(path)
+        network, names, input_hw = loaded.network, loaded.names, loaded.input_hw
+    else:
+        (network, names), input_hw = _load_checkpoint(path), CAMERA_HW
+    network = network.fuse(verbose=False).eval()
+    for parameter in network.parameters():
+        parameter.requires_grad_(False)
+    head: Any = network.model[-1]
+    head.export = True  # plain outputs, without what only the training needs
+    return DetectorModule(network=network, names=names, input_hw=input_hw)
+
+
+def exported(path: Path, folder: Path | None = None) -> Path:
+    """Return an ONNX file of the detector at `path` (.npz, .pt), made the first time and kept in `folder`.
+
+    Making it takes some seconds, nearly all of them to load torch and ultralytics, which nobody needs afterwards.
+
+    Args:
+        path: the weights.
+        folder: where to keep it; by default the user's cache.
+
+    Raises:
+        WeightsError: as `load_module`.
+    """
+    digest = checked_sha256(path, MAKER) if path.suffix == ".npz" else sha256_of(path)
+    target = (folder or cache_folder()) / f"{path.stem}-{digest[:16]}-{_EXPORT}.onnx"
+    if not target.is_file():
+        partial = target.with_name(f".{target.name}.{os.getpid()}")
+        try:
+            with single_threaded_workers(1, "export") as worker:
+                worker.submit(lambda: _export(load_module(path), partial)).result()
+            partial.replace(target)  # nobody ever sees half of it
+        finally:
+            partial.unlink(missing_ok=True)
+    return target
+
+
+def cache_folder() -> Path:
+    """Return the folder for what can be made again: the user's, or, where that cannot be written, a new one in /tmp."""
+    home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    folder = home / "z1-grasp"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            return folder
+    except OSError:
+        return Path(tempfile.mkdtemp(prefix="z1-grasp-"))
+
+
+def _load_checkpoint(path: Path) -> tuple[Any, tuple[str, ...]]:
+    tame_ultralytics()
+    from ultralytics.nn.tasks import torch_safe_load
+
+    try:
+        checkpoint, _ = torch_safe_load(str(path), safe_only=True)
+        network: Any = checkpoint.get("ema") or checkpoint["model"]
+        head = type(network.model[-1]).__name__
+    except Exception as err:  # whatever unpickling a stranger's file ends in
+        reason = str(err).splitlines()[0][:120] if str(err) else type(err).__name__
+        raise WeightsError(f"{path.name} is no checkpoint of ultralytics' YOLO ({reason}).") from err
+    if head not in ("Detect", "Segment") or network.model[-1].end2end:
+        raise WeightsError(f"{path.name} ends in a {head}; a YOLOv8 (or 11) that detects or segments is understood.")
+    return network.float(), tuple(network.names[i] for i in range(len(network.names)))
+
+
+def _export(module: DetectorModule, path: Path) -> None:
+    import onnx
+    import torch
+
+    outputs = ["output0", "output1"][: 2 if hasattr(module.network.model[-1], "proto") else 1]
+    image = torch.zeros(1, 3, *module.input_hw)
+    with warnings.catch_warnings(), torch.no_grad():
+        # The exporter through torch.export takes ten times as long and wants another package.
+        warnings.simplefilter("ignore")
+        torch.onnx.export(
+            module.network,
+            (image,),
+            path,
+            dynamo=False,
+            opset_version=17,
+            input_names=["images"],
+            output_names=outputs,
+        )
+    model = onnx.load(path)
+    # As ultralytics writes it, so that this file and a user's are read alike.
+    values = {"names": str(dict(enumerate(module.names))), "task": "segment" if len(outputs) == 2 else "detect"}
+    onnx.helper.set_model_props(model, values)
+    onnx.save(model, path)

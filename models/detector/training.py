@@ -1,0 +1,183 @@
+"""YOLOv8n-seg trained on a CPU: ultralytics' trainer, with the network in bfloat16 and the loss in float32."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from models.detector.weights import ARCHITECTURE, new_network, tame_ultralytics
+
+tame_ultralytics()  # before ultralytics is loaded
+
+import torch  # noqa: E402
+import ultralytics.utils  # noqa: E402
+from torch import distributed  # noqa: E402
+from ultralytics.models.yolo.segment import SegmentationTrainer  # noqa: E402
+from ultralytics.nn.tasks import SegmentationModel  # noqa: E402
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Phase:
+    """One run at one picture size; each phase starts from the weights of the one before."""
+
+    imgsz: int
+    """Longer side of the pictures [px]."""
+    epochs: int
+    lr0: float
+    """Learning rate after the warm-up."""
+    lrf: float
+    """Share of `lr0` at the end; a straight line between, in steps of one batch."""
+    warmup_epochs: float
+    batch: int = 16
+    fraction: int | float = 12_000
+    """How many pictures, the first of those that are there; or which share of them."""
+
+
+PHASES = (
+    Phase(imgsz=192, epochs=12, lr0=2.0e-3, lrf=0.8, warmup_epochs=1.0),
+    Phase(imgsz=256, epochs=9, lr0=1.6e-3, lrf=0.75, warmup_epochs=0.2),
+    Phase(imgsz=320, epochs=11, lr0=1.2e-3, lrf=0.02, warmup_epochs=0.2),
+    Phase(imgsz=320, epochs=2, lr0=6.0e-4, lrf=0.02, warmup_epochs=0.1, fraction=1.0),
+)
+"""Small pictures teach most of it at a fraction of the time; the last have the size at which the network is used. The
+learning rate falls all the way, and once more over the last passes, for which there are more pictures."""
+
+AUGMENTATION = {
+    "hsv_h": 0.03,
+    "hsv_s": 0.5,
+    "hsv_v": 0.3,
+    "degrees": 3.0,
+    "translate": 0.05,
+    "scale": 0.2,
+    "fliplr": 0.5,
+    "mosaic": 0.0,
+}
+"""On top of what the scenes vary themselves. No mosaic: four scenes of a quarter's size are not what the arm sees."""
+
+GAINS = {"cls": 1.0}
+"""Of the loss, where they are not ultralytics' own: outlines are good early, what is an object is learnt last."""
+
+
+class Bf16SegmentationModel(SegmentationModel):
+    """The network runs in bfloat16 (twice as fast where the processor has AVX-512 BF16), its loss in float32."""
+
+    def loss(self, batch, preds=None):
+        """Return ultralytics' loss and its parts."""
+        if preds is None:
+            with torch.autocast("cpu", torch.bfloat16):
+                preds = self.forward(batch["img"])
+        return super().loss(batch, _to_float(preds))
+
+
+class CpuSegmentationTrainer(SegmentationTrainer):
+    """Ultralytics' trainer without validation between epochs, for a network in bfloat16 and channels-last."""
+
+    def get_model(self, cfg=None, weights=None, verbose=True):
+        """Return the network, with `weights` if given."""
+        model = Bf16SegmentationModel(
+            cfg or f"{ARCHITECTURE}.yaml",  # pyright: ignore[reportArgumentType] - a checkpoint's is a dict
+            nc=self.data["nc"],
+            ch=self.data["channels"],
+            verbose=False,
+        )
+        model = self.set_model_names_for_load(model)
+        if weights:
+            model.load(weights)
+        return model.to(memory_format=torch.channels_last)
+
+    def preprocess_batch(self, batch: dict) -> dict:
+        """Return the batch with its pictures in channels-last."""
+        batch = super().preprocess_batch(batch)
+        batch["img"] = batch["img"].contiguous(memory_format=torch.channels_last)
+        return batch
+
+    def _setup_train(self) -> None:
+        """Prepare, then start all processes from the first one's weights."""
+        super()._setup_train()
+        if distributed.is_initialized():
+            for value in self.model.state_dict().values():
+                distributed.broadcast(value, 0)
+
+    def optimizer_step(self) -> None:
+        """Step, with the mean gradient of all processes and the learning rate of this very batch.
+
+        Ultralytics' own rate falls once an epoch, and its own processes want a GPU each.
+        """
+        if distributed.is_initialized():
+            self._average_gradients()
+        super().optimizer_step()
+        batches = len(self.train_loader)
+        self.steps = getattr(self, "steps", self.start_epoch * batches) + 1
+        if self.steps > self._get_warmup_iterations(batches):
+            assert self.optimizer is not None and self.lf is not None
+            for group in self.optimizer.param_groups:
+                group["lr"] = group["initial_lr"] * self.lf(self.steps / batches)
+
+    def _average_gradients(self) -> None:
+        gradients = [p.grad for p in self.model.parameters() if p.grad is not None]
+        flat = torch.cat([gradient.flatten() for gradient in gradients]) / distributed.get_world_size()
+        distributed.all_reduce(flat)
+        for gradient, mean in zip(gradients, flat.split([g.numel() for g in gradients]), strict=True):
+            gradient.copy_(mean.view_as(gradient))
+
+    def validate(self):
+        """Skip: held-out pictures are for the measurement after the training alone."""
+        return {}, float(self.epoch)
+
+    def final_eval(self) -> None:
+        """Skip, for the same reason; the checkpoint stays as it is."""
+
+
+def train_phase(phase: Phase, *, data: Path, folder: Path, start: Path | None, seed: int, threads: int) -> Path:
+    """Train one phase, or what is left of it, and return its last checkpoint.
+
+    Where a process group of torch.distributed is there (RANK, LOCAL_RANK and WORLD_SIZE set before ultralytics is
+    imported), its processes share each batch.
+
+    Args:
+        phase: what to do.
+        data: ultralytics' description of the data set (`data.yaml`).
+        folder: of this phase; a checkpoint in it is taken up where it stopped.
+        start: checkpoint of the phase before; None = from scratch.
+        seed: of weights, order and augmentation.
+        threads: of torch.
+    """
+    last = folder / "weights" / "last.pt"
+    if (folder / "done").exists():
+        return last
+    settings = asdict(phase) | AUGMENTATION | GAINS
+    settings |= {"model": f"{ARCHITECTURE}.yaml", "data": str(data), "pretrained": str(start) if start else False}
+    settings |= {"project": str(folder.parent), "name": folder.name, "exist_ok": True, "device": "cpu", "seed": seed}
+    settings |= {"optimizer": "AdamW", "weight_decay": 0.005, "nbs": phase.batch, "momentum": 0.9, "workers": 0}
+    settings |= {"rect": True, "amp": False, "val": False, "plots": False, "patience": 0, "close_mosaic": 0}
+    settings |= {"warmup_bias_lr": 0.0, "deterministic": True, "resume": str(last) if last.exists() else False}
+    settings["batch"] = phase.batch // (distributed.get_world_size() if distributed.is_initialized() else 1)
+    settings["cache"] = "ram"  # the pictures at the phase's size: 0.7 to 3 GB
+    if distributed.is_initialized() and distributed.get_rank() != ultralytics.utils.RANK:
+        raise RuntimeError("ultralytics does not know of the other processes, so each would see all pictures.")
+    trainer = CpuSegmentationTrainer(overrides=settings)
+    trainer.add_callback("on_train_start", lambda _: torch.set_num_threads(threads))
+    trainer.world_size = 1 if distributed.is_initialized() else 0  # gradients are averaged here, not summed there
+    trainer.train()
+    if distributed.is_initialized():
+        distributed.barrier()  # the first has written what the others go on from
+    (folder / "done").touch()
+    return last
+
+
+def read_checkpoint(path: Path) -> torch.nn.Module:
+    """Return the averaged weights of a checkpoint of ours in a plain float32 network."""
+    saved = torch.load(path, map_location="cpu", weights_only=False)["ema"].float()
+    model = new_network(len(saved.names))
+    model.load_state_dict(saved.state_dict())
+    return model
+
+
+def _to_float(value):
+    if isinstance(value, torch.Tensor):
+        return value.float()
+    if isinstance(value, dict):
+        return {key: _to_float(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return type(value)(_to_float(item) for item in value)
+    return value

@@ -1,0 +1,132 @@
+"""The detector's own weights on disk: YOLOv8n-seg as plain arrays, with the names of its classes and a checksum."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from models.weights_file import WEIGHTS_FOLDER, WeightsError, read_arrays, write_arrays
+
+if TYPE_CHECKING:
+    from torch import nn
+
+CLASSES = ("bottle", "cylinder", "box")
+"""What the shipped detector tells apart, in the order of its outputs."""
+ARCHITECTURE = "yolov8n-seg"
+INPUT_HW = (256, 320)
+"""(H, W) to which images are scaled before it looks [px]: what its training ends at, in whole strides of 32."""
+CAMERA_HW = (480, 640)
+"""(H, W) of the D405's images [px], which other networks are shown as they are if they have no size of their own."""
+MAKER = "python -m scripts.train.train_detector"
+"""The command that makes the weights."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LoadedDetector:
+    """A network and what its outputs mean."""
+
+    network: nn.Module
+    """SegmentationModel of ultralytics, in evaluation mode, float32, not fused."""
+    names: tuple[str, ...]
+    """Classes in the order of the outputs."""
+    input_hw: tuple[int, int]
+    """(H, W) of the images it was trained for [px]."""
+
+
+def detector_path() -> Path:
+    """Return where the shipped detector's weights lie."""
+    return WEIGHTS_FOLDER / "detector.npz"
+
+
+def save_detector(
+    path: Path,
+    model: nn.Module,
+    names: Sequence[str] | Mapping[int, str] = CLASSES,
+    input_hw: tuple[int, int] = INPUT_HW,
+) -> str:
+    """Write a trained YOLOv8n-seg to `path` (.npz) and its SHA-256 beside it; return the latter.
+
+    Matrices and kernels are kept in half precision. Vectors, above all the variances of the batch norms, whose range is
+    wider than that of half precision, stay as they are: they are one hundredth of it all.
+
+    Args:
+        path: the file, ending in .npz.
+        model: ultralytics' SegmentationModel (of a `YOLO`, its `.model`), not fused.
+        names: its classes in the order of the outputs, as a sequence or as ultralytics' {index: name}.
+        input_hw: (H, W) of the images it was trained for, multiples of 32 [px].
+
+    Raises:
+        WeightsError: the model is not a YOLOv8n-seg with that many classes, is fused, or is not finite.
+    """
+    names = tuple(names[i] for i in range(len(names)))
+    state = {key: value.detach().cpu().numpy() for key, value in model.state_dict().items()}
+    with np.errstate(over="ignore"):  # asked for next
+        arrays = {f"network/{key}": _compact(value) for key, value in state.items()}
+    for key, value in arrays.items():
+        if not np.isfinite(value).all():
+            raise WeightsError(f"{key} of the model is not finite in half precision; the training went astray.")
+    _network(arrays, len(names), f"the model for {path.name}")  # nothing is written that could not be read
+    return write_arrays(
+        path,
+        {"architecture": np.array(ARCHITECTURE), "names": np.array(names), "input_hw": np.array(input_hw), **arrays},
+    )
+
+
+def load_detector(path: Path) -> LoadedDetector:
+    """Return the network of the file at `path`, ready to look.
+
+    Raises:
+        WeightsError: the file or its checksum is missing, they do not agree, or the file is of another network.
+    """
+    arrays = read_arrays(path, MAKER)
+    if lacking := [key for key in ("architecture", "names", "input_hw") if key not in arrays]:
+        raise WeightsError(f"{path.name} is no detector: it lacks {', '.join(lacking)}.")
+    if (architecture := str(arrays["architecture"])) != ARCHITECTURE:
+        raise WeightsError(f"{path.name} holds a {architecture}; this version reads {ARCHITECTURE}.")
+    names = tuple(str(name) for name in arrays["names"])
+    height, width = (int(size) for size in arrays["input_hw"])
+    return LoadedDetector(network=_network(arrays, len(names), path.name), names=names, input_hw=(height, width))
+
+
+def new_network(n_classes: int) -> nn.Module:
+    """Return an untrained YOLOv8n-seg for `n_classes`, in evaluation mode."""
+    tame_ultralytics()
+    from ultralytics.nn.tasks import SegmentationModel
+
+    return SegmentationModel(f"{ARCHITECTURE}.yaml", ch=3, nc=n_classes, verbose=False).eval()
+
+
+def tame_ultralytics() -> None:
+    """Keep ultralytics, which is imported after this, from installing packages, asking its servers, and talking."""
+    os.environ.setdefault("YOLO_AUTOINSTALL", "false")
+    os.environ.setdefault("YOLO_VERBOSE", "false")
+    os.environ.setdefault("YOLO_OFFLINE", "true")
+
+
+def _compact(value: np.ndarray) -> np.ndarray:
+    if value.dtype.kind != "f":
+        return value  # counters
+    return value.astype(np.float16 if value.ndim > 1 else np.float32)
+
+
+def _network(arrays: Mapping[str, np.ndarray], n_classes: int, what: str) -> nn.Module:
+    """Return the network filled with those of `arrays` that are its own."""
+    import torch
+
+    state = {
+        key.removeprefix("network/"): torch.from_numpy(value.astype(np.float32) if value.dtype.kind == "f" else value)
+        for key, value in arrays.items()
+        if key.startswith("network/")
+    }
+    network = new_network(n_classes)
+    try:
+        network.load_state_dict(state)
+    except RuntimeError as err:
+        first = "; ".join(line.strip() for line in str(err).splitlines()[1:2])
+        raise WeightsError(f"{what} is not a {ARCHITECTURE} (not fused) of {n_classes} classes: {first[:200]}") from err
+    return network

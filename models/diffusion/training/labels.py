@@ -1,0 +1,248 @@
+"""What counts as a grasp: hands as data, ground-truth grasps of a solid, and an exact check of any grasp."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from numba import njit
+
+from hal.base.errors import InvalidValueError
+from models.diffusion.training.solids import Solid, distance_at, normal_at, trace
+from models.diffusion.training.z1_gripper import LAY, BeakSpec, check_beak
+
+_LAY = np.array(LAY)
+_SAME_CONTACT_M = 0.0015  # a pad lies on all points it would reach within this distance
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GripperSpec:
+    """A parallel jaw in the grasp frame: z approach, y closing, origin midway between the open fingertips."""
+
+    name: str
+    max_width_m: float
+    """Opening with which the hand approaches [m]."""
+    min_width_m: float = 0.004
+    """Narrowest object that ground truth closes on [m]."""
+    finger_length_m: float = 0.07
+    """From the palm to the fingertips [m]."""
+    finger_thickness_m: float = 0.012
+    """Of one finger, along y [m]."""
+    finger_width_m: float = 0.022
+    """Of one finger, along x [m]."""
+    palm_width_m: float = 0.06
+    """Of the palm, along x [m]."""
+    palm_length_m: float = 0.08
+    """How far the hand reaches back behind the fingers [m]."""
+    min_depth_m: float = 0.004
+    """Least reach of the fingertips past the contacts in ground truth [m]."""
+    max_depth_m: float = 0.02
+    """Greatest reach of the fingertips past the contacts in ground truth [m]."""
+    friction: float = 0.5
+    """Coulomb coefficient that a valid grasp may count on."""
+    symmetric: ClassVar[bool] = True
+    """Whether the hand looks the same turned over."""
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.min_width_m < self.max_width_m:
+            raise InvalidValueError(f"Want 0 < min_width_m < max_width_m; got {self.min_width_m}, {self.max_width_m}.")
+        if not 0.0 <= self.min_depth_m <= self.max_depth_m < self.finger_length_m:
+            raise InvalidValueError(f"Want 0 ≤ min_depth_m ≤ max_depth_m < finger_length_m; got {self}.")
+
+    def body_points(self) -> np.ndarray:
+        """Return points (K, 3) on the open hand's fingers and palm; they are what must not touch an object."""
+        inner, outer = self.max_width_m / 2.0, self.max_width_m / 2.0 + self.finger_thickness_m
+        half = self.finger_width_m / 2.0
+        z_finger = np.linspace(-self.finger_length_m, 0.0, 11)
+        fingers = [_grid([-half, 0.0, half], [s * inner, s * outer], z_finger) for s in (-1.0, 1.0)]
+        z_palm = -self.finger_length_m - np.array([0.0, 0.3, 1.0]) * self.palm_length_m
+        palm_half = self.palm_width_m / 2.0
+        palm = _grid(np.linspace(-palm_half, palm_half, 5), np.linspace(-outer, outer, 17), z_palm)
+        return np.concatenate([*fingers, palm])
+
+    def pad_points(self) -> np.ndarray:
+        """Return points (K, 2) x, z on a finger's inner face, whence it closes."""
+        half = 0.8 * self.finger_width_m / 2.0
+        grid = _grid([-half, 0.0, half], [0.0], np.linspace(-0.7 * self.finger_length_m, -0.001, 8))
+        return np.ascontiguousarray(grid[:, [0, 2]])
+
+
+Hand = GripperSpec | BeakSpec
+GRIPPERS: dict[str, Hand] = {
+    "agnostic": GripperSpec(name="agnostic", max_width_m=0.136),
+    "z1": BeakSpec(name="z1"),
+}
+"""Hands that weights can be trained for; `agnostic` has the opening of a Robotiq 2F-140 (its datasheet)."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class GraspCheck:
+    """What the exact solid says of some grasps."""
+
+    free: np.ndarray
+    """(N,) bool, the open hand touches nothing."""
+    antipodal: np.ndarray
+    """(N,) bool, both pads of a free hand touch, each within the friction cone."""
+    widths_m: np.ndarray
+    """(N,) distance between the contacts [m]; NaN where a pad touches nothing or the hand is not free."""
+    offsets_m: np.ndarray
+    """(N,) how far the contacts' middle lies from the grasp's origin along y [m]; NaN as above."""
+
+    @property
+    def valid(self) -> np.ndarray:
+        """(N,) bool, free and antipodal."""
+        return self.free & self.antipodal
+
+    def __getitem__(self, index: np.ndarray | slice) -> GraspCheck:
+        """Return what is said of the grasps that `index` picks."""
+        return GraspCheck(
+            free=self.free[index],
+            antipodal=self.antipodal[index],
+            widths_m=self.widths_m[index],
+            offsets_m=self.offsets_m[index],
+        )
+
+
+def check_grasps(
+    solid: Solid,
+    T: np.ndarray,
+    gripper: Hand,
+    widths_m: np.ndarray | None = None,
+    *,
+    clearance_m: float = 0.0,
+    cone_rad: float | None = None,
+) -> GraspCheck:
+    """Return whether the grasps `T` (N, 4, 4) in the solid's frame hold.
+
+    Args:
+        solid: the true object.
+        T: poses in the grasp frame (z approach, y closing).
+        gripper: the hand.
+        widths_m: (N,) what is to be held is said to be this wide; a beak is laid around it, a parallel jaw needs none.
+        clearance_m: free space that the open hand needs.
+        cone_rad: greatest angle between closing line and contact normal; the gripper's friction cone if None.
+
+    Raises:
+        ValueError: the hand is a beak, and no widths are given.
+    """
+    cone = float(np.arctan(gripper.friction)) if cone_rad is None else cone_rad
+    T = np.ascontiguousarray(T, dtype=np.float64)
+    shape = (solid.parts, solid.profiles, T)
+    if isinstance(gripper, BeakSpec):
+        if widths_m is None:
+            raise InvalidValueError(
+                f"Grasps of the hand {gripper.name!r} are checked with their widths; give widths_m (N,)."
+            )
+        widths = np.ascontiguousarray(np.broadcast_to(widths_m, len(T)), dtype=np.float64)
+        body = (gripper.fixed_points, gripper.turning_points)
+        faces = (gripper.fixed_face_points, gripper.turning_face_points)
+        free, antipodal, widths, offsets = check_beak(*shape, widths, *body, *faces, _LAY, clearance_m, np.cos(cone))
+    else:
+        body = (gripper.body_points(), gripper.pad_points(), gripper.max_width_m / 2.0)
+        free, antipodal, widths, offsets = _check(*shape, *body, clearance_m, np.cos(cone))
+    return GraspCheck(free=free, antipodal=antipodal, widths_m=widths, offsets_m=offsets)
+
+
+def find_grasps(
+    solid: Solid, gripper: Hand, rng: np.random.Generator, n_contacts: int = 900, n_turns: int = 4
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return ground-truth grasps (N, 4, 4) of `solid` from all sides and their widths (N,) [m].
+
+    Contacts are drawn over the surface, paired along nearly their normal, and approached from all directions square
+    to the closing line. Ground truth keeps 3 mm of clearance and a cone of 17°, well within what `check_grasps` allows,
+    so that a generator may miss it by a little.
+    """
+    first, closing = _draw_contacts(solid, n_contacts, rng)
+    # The far finger starts somewhere outside, not beyond everything: so it also closes on walls and single branches.
+    start = rng.uniform(0.02, gripper.max_width_m, len(first))
+    far = first + start[:, None] * closing
+    outside = solid.distance(far) > 0.002
+    first, closing, start, far = first[outside], closing[outside], start[outside], far[outside]
+    widths = start - solid.cast(far, -closing, gripper.max_width_m)
+    fits = (widths > gripper.min_width_m) & (widths < gripper.max_width_m - 0.008)
+    first, closing, widths = (np.repeat(a[fits], n_turns, axis=0) for a in (first, closing, widths))
+    approach = _unit(np.cross(closing, _unit(rng.normal(size=closing.shape))))
+    depth = rng.uniform(gripper.min_depth_m, gripper.max_depth_m, (len(first), 1))
+    T = np.tile(np.eye(4), (len(first), 1, 1))
+    T[:, :3, :3] = np.stack([np.cross(closing, approach), closing, approach], axis=2)
+    T[:, :3, 3] = first + 0.5 * widths[:, None] * closing + depth * approach
+    check = check_grasps(solid, T, gripper, widths, clearance_m=0.003, cone_rad=0.3)
+    good = check.valid & (np.abs(check.offsets_m) < 0.004)
+    return T[good], check.widths_m[good]
+
+
+def _draw_contacts(solid: Solid, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Return points (N, 3) on the surface and unit closing directions (N, 3) into it."""
+    radius = solid.enclosing_radius()
+    ray = _unit(rng.normal(size=(count, 3)))
+    aim = rng.uniform(-0.8, 0.8, (count, 3)) * radius
+    origin = aim - 2.5 * radius * ray
+    reach = solid.cast(origin, ray, 5.0 * radius)
+    hit = np.isfinite(reach)
+    points = origin[hit] + reach[hit, None] * ray[hit]
+    normals = solid.normals(points)
+    return points, _unit(-normals + rng.normal(size=normals.shape) * np.tan(0.1))
+
+
+def _grid(x, y, z) -> np.ndarray:
+    return np.stack(np.meshgrid(x, y, z, indexing="ij"), axis=-1).reshape(-1, 3).astype(np.float64)
+
+
+def _unit(v: np.ndarray) -> np.ndarray:
+    return v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-12)
+
+
+@njit(cache=True)
+def _is_free(parts, profiles, T, body, clearance):
+    for k in range(len(body)):
+        b = body[k]
+        x = T[0, 0] * b[0] + T[0, 1] * b[1] + T[0, 2] * b[2] + T[0, 3]
+        y = T[1, 0] * b[0] + T[1, 1] * b[1] + T[1, 2] * b[2] + T[1, 3]
+        z = T[2, 0] * b[0] + T[2, 1] * b[1] + T[2, 2] * b[2] + T[2, 3]
+        if distance_at(parts, profiles, x, y, z) <= clearance:
+            return False
+    return True
+
+
+@njit(cache=True)
+def _close_finger(parts, profiles, T, pads, side, half):  # noqa: PLR0917 (compiled functions take no keywords)
+    """Return how far one finger closes until it touches, and the cosine of its contact's normal to the closing line."""
+    cx, cy, cz = -side * T[0, 1], -side * T[1, 1], -side * T[2, 1]
+    reach = np.empty(len(pads))
+    origins = np.empty((len(pads), 3))
+    for k in range(len(pads)):
+        for i in range(3):
+            origins[k, i] = T[i, 0] * pads[k, 0] + T[i, 1] * side * half + T[i, 2] * pads[k, 1] + T[i, 3]
+        reach[k] = trace(parts, profiles, origins[k, 0], origins[k, 1], origins[k, 2], cx, cy, cz, 2.0 * half)
+    nearest = reach.min()
+    if not nearest < 2.0 * half:
+        return np.inf, 0.0
+    sx, sy, sz = 0.0, 0.0, 0.0
+    for k in range(len(pads)):
+        if reach[k] < nearest + _SAME_CONTACT_M:
+            r, o = reach[k], origins[k]
+            nx, ny, nz = normal_at(parts, profiles, o[0] + r * cx, o[1] + r * cy, o[2] + r * cz)
+            sx, sy, sz = sx + nx, sy + ny, sz + nz
+    norm = np.sqrt(sx * sx + sy * sy + sz * sz) + 1e-12
+    return nearest, -(sx * cx + sy * cy + sz * cz) / norm
+
+
+@njit(cache=True)
+def _check(parts, profiles, T, body, pads, half, clearance, cos_cone):  # noqa: PLR0917
+    n = len(T)
+    free, antipodal = np.zeros(n, dtype=np.bool_), np.zeros(n, dtype=np.bool_)
+    widths, offsets = np.full(n, np.nan), np.full(n, np.nan)
+    for i in range(n):
+        free[i] = _is_free(parts, profiles, T[i], body, clearance)
+        if not free[i]:
+            continue
+        left, cos_left = _close_finger(parts, profiles, T[i], pads, 1.0, half)
+        if left == np.inf:
+            continue
+        right, cos_right = _close_finger(parts, profiles, T[i], pads, -1.0, half)
+        if right == np.inf or left + right >= 2.0 * half:
+            continue
+        widths[i], offsets[i] = 2.0 * half - left - right, 0.5 * (right - left)
+        antipodal[i] = cos_left > cos_cone and cos_right > cos_cone
+    return free, antipodal, widths, offsets

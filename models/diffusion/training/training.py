@@ -1,0 +1,210 @@
+"""Trains the generator, and the discriminator on what was said of the generator's samples."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+import torch
+from scipy.optimize import minimize
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from models.diffusion.network import Denoiser, Discriminator, encode_grasps
+from models.diffusion.training.data import GraspData, augment
+from models.diffusion.training.labelled_samples import JudgedSamples, JudgingConfig
+
+Network = TypeVar("Network", bound=nn.Module)
+Progress = Callable[[int, float], None]
+"""Called with the iteration and the loss."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrainingConfig:
+    """How long and how fast; the recipe that is written beside the weights."""
+
+    generator_iterations: int = 15000
+    generator_rate: float = 1.5e-3
+    views_per_batch: int = 20
+    grasps_per_view: int = 72
+    discriminator_iterations: int = 4000
+    discriminator_rate: float = 1.0e-3
+    judging: JudgingConfig = field(default_factory=JudgingConfig)
+    seed: int = 0
+
+
+def train_generator(
+    data: GraspData,
+    config: TrainingConfig,
+    checkpoint: Path,
+    progress: Progress,
+    *,
+    symmetric: bool = True,
+    start_from: Denoiser | None = None,
+) -> Denoiser:
+    """Return the generator, its weights averaged over the last iterations; goes on from `checkpoint` if it is there.
+
+    Args:
+        data: what to learn.
+        config: how long and how fast.
+        checkpoint: file to go on from and to write.
+        progress: told of each iteration.
+        symmetric: whether the hand is its own mirror image.
+        start_from: another hand's generator, to be tuned for this one.
+    """
+    model = _seeded(Denoiser, config.seed)
+    if start_from is not None:
+        model.load_state_dict(start_from.state_dict())
+    average = _seeded(Denoiser, config.seed)
+    average.load_state_dict(model.state_dict())
+    n_views = len(data.clouds)
+
+    def loss_at(rng: np.random.Generator) -> Tensor:
+        views = rng.integers(0, n_views, config.views_per_batch)
+        T, widths = data.draw_grasps(views, config.grasps_per_view, rng)
+        grasps = encode_grasps(torch.from_numpy(T), torch.from_numpy(widths))
+        cloud = torch.from_numpy(data.clouds[views].astype(np.float32))
+        cloud, grasps = augment(cloud, grasps, symmetric)
+        return model.loss(cloud, grasps)
+
+    for iteration, loss in _descend(
+        model,
+        average,
+        loss_at=loss_at,
+        rate=config.generator_rate,
+        iterations=config.generator_iterations,
+        seed=config.seed,
+        checkpoint=checkpoint,
+    ):
+        progress(iteration, loss)
+    return average.eval()
+
+
+def train_discriminator(
+    generator: Denoiser,
+    data: GraspData,
+    judged: JudgedSamples,
+    *,
+    config: TrainingConfig,
+    checkpoint: Path,
+    progress: Progress,
+    symmetric: bool = True,
+) -> Discriminator:
+    """Return the discriminator; its encoder starts from the generator's. `symmetric` as for that."""
+    model = _seeded(Discriminator, config.seed)
+    model.encoder.load_state_dict(generator.encoder.state_dict())
+    average = _seeded(Discriminator, config.seed)
+    average.load_state_dict(model.state_dict())
+
+    def loss_at(rng: np.random.Generator) -> Tensor:
+        rows = rng.integers(0, len(judged.views), 16)
+        cloud = torch.from_numpy(data.clouds[judged.views[rows]].astype(np.float32))
+        cloud, grasps = augment(cloud, judged.grasps[rows], symmetric)
+        return F.binary_cross_entropy_with_logits(model(cloud, grasps).float(), judged.valid[rows])
+
+    for iteration, loss in _descend(
+        model,
+        average,
+        loss_at=loss_at,
+        rate=config.discriminator_rate,
+        iterations=config.discriminator_iterations,
+        seed=config.seed,
+        checkpoint=checkpoint,
+    ):
+        progress(iteration, loss)
+    return average.eval()
+
+
+def calibrate_discriminator(
+    discriminator: Discriminator, data: GraspData, judged: JudgedSamples
+) -> tuple[float, float]:
+    """Set scale and offset of the discriminator's logits so that its scores are the shares that hold; return both.
+
+    Args:
+        discriminator: changed in its last layer.
+        data: shapes that it was not trained on.
+        judged: what was said of samples on those.
+    """
+    with torch.inference_mode():
+        logits = torch.cat(
+            [
+                discriminator(torch.from_numpy(data.clouds[[view]].astype(np.float32)), grasps[None])
+                for view, grasps in zip(judged.views, judged.grasps, strict=True)
+            ]
+        )
+    x, y = logits.flatten().double().numpy(), judged.valid.flatten().double().numpy()
+
+    def surprise(parameters: np.ndarray) -> float:
+        z = parameters[0] * x + parameters[1]
+        return float(np.mean(np.logaddexp(0.0, z) - y * z))
+
+    scale, offset = (float(p) for p in minimize(surprise, [1.0, 0.0], method="Nelder-Mead").x)
+    last = discriminator.head.leave[-1]
+    assert isinstance(last, nn.Linear)
+    with torch.no_grad():
+        last.weight.mul_(scale)
+        last.bias.mul_(scale).add_(offset)
+    return scale, offset
+
+
+def _seeded(make: Callable[[], Network], seed: int) -> Network:
+    torch.manual_seed(seed)
+    return make()
+
+
+def _descend(
+    model: nn.Module,
+    average: nn.Module,
+    *,
+    loss_at: Callable[[np.random.Generator], Tensor],
+    rate: float,
+    iterations: int,
+    seed: int,
+    checkpoint: Path,
+) -> Iterator[tuple[int, float]]:
+    """Yield (iteration, loss) while AdamW runs down a cosine; `average` follows `model`. bfloat16 where it helps."""
+    optimiser = torch.optim.AdamW(model.parameters(), lr=rate, betas=(0.9, 0.98), weight_decay=0.01)
+    start = 0
+    if checkpoint.exists():
+        saved = torch.load(checkpoint, weights_only=True)
+        model.load_state_dict(saved["model"])
+        average.load_state_dict(saved["average"])
+        optimiser.load_state_dict(saved["optimiser"])
+        start = int(saved["iteration"])
+    for iteration in range(start, iterations):
+        # Seeds of each iteration's own: a resumed run draws what an unbroken one would.
+        rng = np.random.default_rng((seed, iteration))
+        torch.manual_seed(seed * 1_000_003 + iteration)
+        for group in optimiser.param_groups:
+            group["lr"] = rate * min(1.0, (iteration + 1) / 100) * _cosine(iteration / iterations)
+        with torch.autocast("cpu", torch.bfloat16):
+            loss = loss_at(rng)
+        optimiser.zero_grad()
+        loss.backward()
+        nn.utils.clip_grad_norm_(model.parameters(), 1.0)
+        optimiser.step()
+        _follow(average, model, min(0.998, (iteration + 1) / (iteration + 50)))
+        if (iteration + 1) % 250 == 0 or iteration + 1 == iterations:
+            _save(checkpoint, model, average, optimiser, iteration + 1)
+        yield iteration + 1, loss.item()
+
+
+def _cosine(fraction: float) -> float:
+    return 0.5 * (1.0 + math.cos(math.pi * fraction)) + 0.01
+
+
+@torch.no_grad()
+def _follow(average: nn.Module, model: nn.Module, keep: float) -> None:
+    for a, b in zip(average.parameters(), model.parameters(), strict=True):
+        a.lerp_(b, 1.0 - keep)
+
+
+def _save(path: Path, model: nn.Module, average: nn.Module, optimiser: torch.optim.Optimizer, iteration: int) -> None:
+    partial = path.with_suffix(".partial")
+    state = {"model": model.state_dict(), "average": average.state_dict(), "optimiser": optimiser.state_dict()}
+    torch.save(state | {"iteration": iteration}, partial)
+    partial.replace(path)

@@ -1,0 +1,140 @@
+"""NVIDIA's GraspGenX behind the house's contract, conditioned on the Z1's own gripper.
+
+Its code (the package `eden-graspgenx`) is under Apache-2.0, its released weights under the NVIDIA Open Model License:
+read that before shipping anything made with them.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import logging
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, redirect_stdout
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from models.nvidia.errors import GeneratorError
+from models.nvidia.nvidia import NvidiaSampler, load_guarded, require_package
+from models.types import GraspGenerator
+
+_LOG = logging.getLogger(__name__)
+
+Z1_GRIPPER: dict[str, Any] = {
+    "open": {"jointGripper": -0.88},
+    "close": {"jointGripper": 0.0},
+    "fingertip": [0.0, 0.0, 0.140],
+    "sweep_volume": {
+        "extents": [0.065, 0.052, 0.058],
+        "offset": [0.0, 0.0, 0.111],
+        "extents2": [0.033, 0.052, 0.065],
+        "offset2": [0.0, 0.0, 0.114],
+    },
+    "standoff": [0.0, 0.03],
+    "bbox": [[-0.05, -0.041, 0.0], [0.05, 0.041, 0.149]],
+    "symmetric": False,
+    "type": "revolute_2f",
+}
+"""The Z1's beak as GraspGenX describes grippers (a `config.json`): z approach, x closing, origin at GripperStator [m].
+
+From the URDF and the faces measured in `z1_runtime/geometry/gripper_geometry.py`, to which a test holds it: the
+mover's axis is 49 mm beyond the origin, the palm reaches 33 mm and the fingertips 100 mm beyond that, the knees that
+touch stand 76.7 mm from the axis, pads are 52 mm wide. `BeakGripper` lays the beak so that both jaws lean alike on an
+object, hence a box symmetric in x: as wide as the knees are apart at the opening for the widest object (65 mm, 0.88
+rad), and at half of it; from the palm to the leaning fingertips. Boston Dynamics' Spot, the other one-jawed gripper
+in their collection, is described likewise.
+"""
+_NAME = "unitree_z1"
+_TOLD_BY_BOXES = ("none", "z_offset", "gripper_type", "sweep_volume", "sweep_volume_v2", "gripper_type+sweep_volume_v2")
+
+
+@cache
+def say_licence_once() -> None:
+    """Say what the licence asks, the first time."""
+    _LOG.info("GraspGenX's weights are under the NVIDIA Open Model License; its code is Apache-2.0.")
+
+
+def load(folder: Path) -> GraspGenerator:
+    """Return GraspGenX with the checkpoints in `folder`: gen/ and dis/, each with a config.yaml and a .pth.
+
+    Raises:
+        GeneratorError: the package or the files are missing, or they are of something else.
+    """
+    for needed in (folder / part / "config.yaml" for part in ("gen", "dis")):
+        if not needed.is_file():
+            raise GeneratorError(f"{needed} is missing; name the folder of a GraspGenX release, with gen/ and dis/.")
+    require_package("graspgenx", "graspgenx")
+    say_licence_once()
+    from models.nvidia import pointnet_ops
+    from models.nvidia.torch_patches import compiled_ops_replaced, cuda_only_if_there, fold_attention
+
+    with compiled_ops_replaced():  # it compiles them while it is imported
+        from graspgenx.grasp_server import GraspGenXSampler  # pyright: ignore[reportMissingImports]
+        from graspgenx.models.pointnet import pointnet2_utils  # pyright: ignore[reportMissingImports]
+        from graspgenx.utils.checkpoint_io import load_model_cfg  # pyright: ignore[reportMissingImports]
+    pointnet2_utils.ops = pointnet_ops
+    with _prints_logged(), _z1_assets() as assets, cuda_only_if_there():
+        cfg = load_guarded(str(folder), lambda: load_model_cfg(str(folder / "gen"), str(folder / "dis")))
+        load_guarded(str(folder), lambda: _check_backbones(cfg))
+        sampler = load_guarded(str(folder), lambda: GraspGenXSampler(cfg, _NAME, str(assets)))
+    fold_attention(sampler.model.grasp_generator.diffusion_head)
+    told = np.concatenate([sampler.gripper.sweep_volume, sampler.gripper.sweep_volume_mid])
+    if not np.allclose(told, sweep_numbers()):
+        raise GeneratorError(f"GraspGenX read another gripper than the Z1's: {told}, not {sweep_numbers()}.")
+    return NvidiaSampler(sampler, sampler.gripper.tool_tcp_transform, f"graspgenx-{_NAME}")
+
+
+def sweep_numbers() -> np.ndarray:
+    """Return the 12 numbers (12,) that condition the network: extents and offset, open and half open [m]."""
+    volume = Z1_GRIPPER["sweep_volume"]
+    return np.concatenate([volume[key] for key in ("extents", "offset", "extents2", "offset2")])
+
+
+def _check_backbones(cfg: Any) -> None:
+    """Check that what is known of the Z1 is all that the networks ask of a gripper.
+
+    Raises:
+        GeneratorError: they ask for point clouds or volumes; GraspGenX would go on with zeros in their place.
+    """
+    for network in ("diffusion", "discriminator"):
+        backbone = cfg[network].gripper_backbone
+        if backbone not in _TOLD_BY_BOXES:
+            raise GeneratorError(
+                f"its {network} is conditioned on the gripper's {backbone!r}, which the Z1's description does not "
+                f"hold; allowed is {', '.join(_TOLD_BY_BOXES)}."
+            )
+
+
+@contextmanager
+def _z1_assets() -> Iterator[Path]:
+    """Yield a folder in which GraspGenX finds the Z1's gripper; within, it looks nowhere else and downloads nothing."""
+    variable = "GRASPGENX_GRIPPER_CFG_DIR"
+    before = os.environ.get(variable)
+    with tempfile.TemporaryDirectory(prefix="z1-gripper-") as name:
+        folder = Path(name) / "x_grippers" / _NAME
+        folder.mkdir(parents=True)
+        (folder / "config.json").write_text(json.dumps(Z1_GRIPPER))
+        os.environ[variable] = name
+        try:
+            yield Path(name)
+        finally:
+            if before is None:
+                del os.environ[variable]
+            else:
+                os.environ[variable] = before
+
+
+@contextmanager
+def _prints_logged() -> Iterator[None]:
+    """Within, what is printed goes to the log: among it warnings of missing files that the Z1 does not need."""
+    printed = io.StringIO()
+    try:
+        with redirect_stdout(printed):
+            yield
+    finally:
+        _LOG.debug("GraspGenX said: %s", printed.getvalue())

@@ -1,0 +1,119 @@
+"""Lets networks written for CUDA run where there is none, without a change to their source."""
+
+from __future__ import annotations
+
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from models.nvidia import pointnet_ops
+
+_PATCHING = threading.RLock()
+
+
+@contextmanager
+def cuda_only_if_there() -> Iterator[None]:
+    """Within, `.cuda()` of tensors and networks leaves them where they are, if this machine has no CUDA.
+
+    Elsewhere in the process such a call would only have raised, so nobody else is led astray.
+    """
+    if torch.cuda.is_available():
+        yield
+        return
+    with _PATCHING:
+        owners: tuple[Any, ...] = (Tensor, nn.Module)
+        kept = [owner.cuda for owner in owners]
+        for owner in owners:
+            owner.cuda = _stay
+        try:
+            yield
+        finally:
+            for owner, method in zip(owners, kept, strict=True):
+                owner.cuda = method
+
+
+def _stay(self: Any, *_: Any, **__: Any) -> Any:
+    return self
+
+
+@contextmanager
+def drawn_from(seed: int) -> Iterator[None]:
+    """Within, the global random numbers of torch and NumPy begin at `seed`; afterwards they go on as before."""
+    state = np.random.get_state()
+    try:
+        with torch.random.fork_rng():
+            torch.manual_seed(seed)
+            np.random.seed(seed % 2**32)
+            yield
+    finally:
+        np.random.set_state(state)
+
+
+@contextmanager
+def compiled_ops_replaced() -> Iterator[None]:
+    """Within, importing the package `pointnet2_ops` gives our operations; it is not compiled and need not be there."""
+    stand_in: Any = ModuleType("pointnet2_ops")
+    stand_in._ext = pointnet_ops
+    before = sys.modules.get("pointnet2_ops")
+    sys.modules["pointnet2_ops"] = stand_in
+    try:
+        yield
+    finally:
+        if before is None:
+            del sys.modules["pointnet2_ops"]
+        else:
+            sys.modules["pointnet2_ops"] = before
+
+
+class _FoldedAttention(nn.Module):
+    """Attention over a sequence of one: its softmax is 1, so what comes out is a linear map of the value."""
+
+    def __init__(self, attention: nn.MultiheadAttention) -> None:
+        super().__init__()
+        dim = attention.embed_dim
+        weight, bias = attention.in_proj_weight, attention.in_proj_bias
+        out = attention.out_proj
+        with torch.no_grad():
+            W_out = out.weight.double()
+            self.linear = nn.Linear(dim, dim, device=out.weight.device, dtype=out.weight.dtype)
+            self.linear.weight.copy_(W_out @ weight[2 * dim :].double())
+            self.linear.bias.copy_(W_out @ bias[2 * dim :].double() + out.bias.double())
+
+    def forward(
+        self, query: Tensor, key: Tensor, value: Tensor, attn_mask: Tensor | None = None
+    ) -> tuple[Tensor, None]:
+        if len(value) != 1 or attn_mask is not None:
+            raise RuntimeError(f"attention over {len(value)} tokens is not the linear map it was folded into.")
+        return self.linear(value), None
+
+
+def fold_attention(network: nn.Module) -> int:
+    """Replace every attention in `network`, which only ever sees one token, by its linear map; return how many.
+
+    The result is the same but for rounding. Three times fewer numbers are read, which is what it waits for on a CPU.
+    """
+    folded = 0
+    for parent in list(network.modules()):
+        for name, child in list(parent.named_children()):
+            if isinstance(child, nn.MultiheadAttention) and _is_plain(child):
+                setattr(parent, name, _FoldedAttention(child).eval())
+                folded += 1
+    return folded
+
+
+def _is_plain(attention: nn.MultiheadAttention) -> bool:
+    """Return whether queries, keys and values are as wide as the network and nothing is added to the sequence."""
+    return (
+        attention.in_proj_weight is not None
+        and attention.in_proj_bias is not None
+        and attention.bias_k is None
+        and not attention.add_zero_attn
+        and not attention.batch_first
+    )

@@ -1,0 +1,58 @@
+"""Messages between a generator's own process and ours: arrays by name, as NumPy's .npz with its length before it.
+
+Needs Python and NumPy alone, of any versions: the other side has packages of its own.
+"""
+
+from __future__ import annotations
+
+import io
+import struct
+from collections.abc import Mapping
+from typing import BinaryIO
+
+import numpy as np
+
+from hal.base.errors import Z1Error
+
+PROTOCOL = 1
+"""Both sides must say the same."""
+_LENGTH = struct.Struct("<Q")
+_MAX_BYTES = 256 << 20
+
+
+class WireError(Z1Error, RuntimeError):
+    """What came is no message: cut off, too long, or not arrays."""
+
+    default_code = "pipe"
+
+
+def write_message(stream: BinaryIO, arrays: Mapping[str, np.ndarray | str | int]) -> None:
+    """Write one message to `stream`."""
+    body = io.BytesIO()
+    np.savez(body, allow_pickle=False, **{name: np.asarray(value) for name, value in arrays.items()})
+    stream.write(_LENGTH.pack(body.tell()) + body.getvalue())
+    stream.flush()
+
+
+def read_message(stream: BinaryIO) -> dict[str, np.ndarray] | None:
+    """Return the next message of `stream`, or None where it has ended.
+
+    Raises:
+        WireError: it ends within a message, or what comes is none.
+    """
+    head = stream.read(_LENGTH.size)
+    if not head:
+        return None
+    if len(head) < _LENGTH.size:
+        raise WireError("the stream ended within a message.")
+    (length,) = _LENGTH.unpack(head)
+    if length > _MAX_BYTES:
+        raise WireError(f"a message of {length} bytes is announced; allowed are {_MAX_BYTES}. Was something printed?")
+    body = stream.read(length)
+    if len(body) < length:
+        raise WireError("the stream ended within a message.")
+    try:
+        with np.load(io.BytesIO(body), allow_pickle=False) as file:
+            return {name: file[name] for name in file.files}
+    except Exception as err:  # NumPy and zipfile raise a dozen kinds for bytes that are no .npz
+        raise WireError(f"a message holds no plain arrays ({err}).") from err

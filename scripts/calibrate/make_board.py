@@ -1,0 +1,45 @@
+"""Write the calibration board as a page to print at 100 %, with a ruler to check the print by.
+
+./z1 calibrate board
+./z1 calibrate board --columns 7 --rows 5 --square-m 0.03 --marker-m 0.022 --out board.png
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+from rich.console import Console
+
+from calibration.board.board import Board
+from calibration.board.sheet import save_sheet
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config:
+    """Which board, on which paper."""
+
+    out: Path = Path("out/board.pdf")
+    """A .pdf or .png."""
+    paper: Literal["A4", "Letter", "A3"] = "A4"
+    """Of the printer."""
+    board: Annotated[Board, tyro.conf.arg(name="")] = field(default_factory=Board)
+    """The board."""
+
+
+def main(config: Config) -> int:
+    """Write the page."""
+    config.out.parent.mkdir(parents=True, exist_ok=True)
+    save_sheet(config.board, config.out, paper=config.paper)
+    Console(highlight=False).print(
+        f"{config.out}: print it at 100 %, check its ruler with your own, and glue it to something flat. If the ruler "
+        "is off, measure a square and give the true --square-m and --marker-m to the other commands.",
+        soft_wrap=True,
+    )
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(tyro.cli(Config)))

@@ -1,0 +1,16 @@
+"""`./z1 test [pytest options]`: run the tests of this checkout; `-m faults` injects each fault and prints a table."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def main(arguments: list[str]) -> int:
+    """Run pytest with `arguments` (default: everything that needs no hardware) and return its exit code."""
+    import pytest
+
+    os.chdir(ROOT)
+    return int(pytest.main(arguments))

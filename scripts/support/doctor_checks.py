@@ -1,0 +1,308 @@
+"""The doctor's questions: each looks at one thing, changes nothing, and never waits long."""
+
+from __future__ import annotations
+
+import errno
+import os
+import platform
+import shutil
+import socket
+import subprocess
+import sys
+from dataclasses import dataclass
+from enum import Enum
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from hal.bus.session import BusConfig
+
+ROOT = Path(__file__).resolve().parents[2]
+ARM_ADDRESS = "192.168.123.110"
+"""The vendor's address of a Z1's board."""
+
+# Without ultralytics, which those who ship this may leave out (see NOTICE).
+_MODULES = [
+    "numpy",
+    "scipy",
+    "numba",
+    "open3d",
+    "trimesh",
+    "pinocchio",
+    "ssik",
+    "ruckig",
+    "mujoco",
+    "cv2",
+    "torch",
+    "zenoh",
+    "msgpack",
+    "rerun",
+    "tyro",
+    "rich",
+    "yaml",
+    "PIL",
+]
+_LIMITS_FILE = "/etc/security/limits.d/z1.conf"
+
+
+class State(Enum):
+    """How a check came out."""
+
+    OK = "ok"
+    WARN = "warn"
+    """Works, but worse than it could."""
+    MISSING = "missing"
+
+
+@dataclass(frozen=True)
+class Check:
+    """One row of the table."""
+
+    name: str
+    state: State
+    seen: str
+    """What was found."""
+    fix: str = ""
+    """What to type or do."""
+
+
+def check_python() -> Check:
+    version = platform.python_version()
+    if (3, 11) <= sys.version_info[:2] <= (3, 14):
+        return Check("python", State.OK, f"{version}, {sys.executable}")
+    return Check("python", State.MISSING, version, "sudo apt install python3.11, then rm -rf .venv and ./z1 --version")
+
+
+def check_packages() -> Check:
+    gone = [name for name in _MODULES if find_spec(name) is None]
+    if gone:
+        return Check("packages", State.MISSING, f"not installed: {', '.join(gone)}", "rm -rf .venv; ./z1 --version")
+    return Check("packages", State.OK, f"all {len(_MODULES)} found")
+
+
+def check_usb_library() -> Check:
+    from hal.libusb import preload
+
+    return Check("libusb", State.OK, preload())
+
+
+def check_processors() -> Check:
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    seen = f"{usable} cores, {platform.machine()}"
+    if usable < 2:
+        return Check("processor", State.WARN, seen, "give it two cores: one belongs to the 500 Hz servo loop")
+    return Check("processor", State.OK, seen)
+
+
+def check_memory() -> Check:
+    total_gb = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9
+    if total_gb < 3.5:
+        return Check("memory", State.WARN, f"{total_gb:.1f} GB", "4 GB or more are comfortable")
+    return Check("memory", State.OK, f"{total_gb:.1f} GB")
+
+
+def check_shared_memory() -> Check:
+    free_mb = shutil.disk_usage("/dev/shm").free / 1e6
+    fix = "sudo mount -o remount,size=256M /dev/shm (in a container: --shm-size=256m)"
+    if free_mb < 64:
+        return Check("shared memory", State.WARN, f"{free_mb:.0f} MB free; images want 64", fix)
+    return Check("shared memory", State.OK, f"{free_mb:.0f} MB free")
+
+
+def check_disk() -> Check:
+    free_gb = shutil.disk_usage(ROOT).free / 1e9
+    if free_gb < 0.2:
+        return Check("disk", State.MISSING, f"{free_gb:.2f} GB free", "make room: a run writes about 20 MB")
+    return Check("disk", State.OK, f"{free_gb:.0f} GB free")
+
+
+def check_bus_port() -> Check:
+    from hal.bus.session import BusConfig
+
+    config = BusConfig(connect_timeout_s=0.5)
+    check = _check_port(
+        "Zenoh port", config.port, f"end the program that holds it, or: ./z1 demo --port {config.port + 1}"
+    )
+    if check.state is State.OK or not (health := _our_hal(config)):
+        return check
+    seen = f"{config.port} is held by our own HAL process (robot {config.robot!r}): {health}"
+    return Check(
+        "Zenoh port",
+        State.WARN,
+        seen,
+        f"use it with ./z1 run; for the demo end it, or: ./z1 demo --port {config.port + 1}",
+    )
+
+
+def _our_hal(config: BusConfig) -> str:
+    """Return how a HAL process of ours does that answers on that port, else nothing."""
+    from hal.base.clock import WallClock
+    from hal.base.errors import HalError
+    from hal.bus.health import describe_health, wait_for_health
+
+    try:
+        return describe_health(wait_for_health(config, WallClock()))
+    except HalError:
+        return ""
+
+
+def check_viewer_port() -> Check:
+    return _check_port("viewer port", 9876, "close the other live view")
+
+
+def check_graphics() -> Check:
+    program = (
+        "from mujoco.egl import GLContext; c = GLContext(64, 64); c.make_current(); from OpenGL import GL; "
+        "print(GL.glGetString(GL.GL_RENDERER).decode())"
+    )
+    fix = "sudo apt install libegl1 libgl1-mesa-dri (until then the twin's camera casts rays, with flat colours)"
+    code, out = _run_python(program, timeout_s=20.0, MUJOCO_GL="egl", PYOPENGL_PLATFORM="egl")
+    if code != 0:
+        return Check("graphics", State.WARN, f"no OpenGL through EGL: {_last_line(out)}", fix)
+    software = any(word in out.lower() for word in ("llvmpipe", "softpipe", "swrast"))
+    return Check("graphics", State.OK, f"EGL, {_last_line(out)}{' (software)' if software else ''}")
+
+
+def check_gpu() -> Check:
+    if shutil.which("nvidia-smi") is None:
+        return Check("GPU", State.OK, "none; not needed")
+    command = ["nvidia-smi", "--query-gpu=name,driver_version", "--format=csv,noheader"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=10, check=False)
+    if done.returncode != 0:
+        return Check("GPU", State.WARN, _last_line(done.stdout + done.stderr), "look at the NVIDIA driver; not needed")
+    return Check("GPU", State.OK, done.stdout.strip().replace("\n", "; "))
+
+
+def check_detector() -> Check:
+    from models.detector.runtimes import installed_runtimes
+    from models.detector.weights import detector_path
+    from models.weights_file import WeightsError
+
+    able = installed_runtimes()
+    if not able:
+        return Check(
+            "detector", State.WARN, "no runtime", "uv sync --extra fast-detector; until then: --detector tabletop"
+        )
+    try:
+        ms = {runtime: _detector_ms(runtime) for runtime in able}
+    except WeightsError as error:
+        fix = f"restore models/weights/{detector_path().name}; until then: --detector tabletop"
+        return Check("detector", State.WARN, str(error), fix)
+    used, best = able[0], min(ms, key=lambda name: ms[name])
+    seen = ", ".join(f"{name} {ms[name]:.0f} ms" for name in able) + f"; {used} is used"
+    if ms[used] > 1.3 * ms[best]:
+        return Check("detector", State.WARN, seen, f"detector_runtime: {best} in the configuration (--config)")
+    return Check("detector", State.OK, seen)
+
+
+def _detector_ms(runtime: str) -> float:
+    """Return the median time to look at an image of 640 x 480 [ms]."""
+    from statistics import median
+
+    import numpy as np
+
+    from hal.base.clock import Stopwatch
+    from models.detector.detector import YoloConfig, YoloDetector
+
+    detector, image = YoloDetector(YoloConfig(runtime=runtime)), np.full((480, 640, 3), 127, np.uint8)
+    watch, times = Stopwatch(), []
+    for _ in range(9):
+        watch.lap_ms()
+        detector.detect(image)
+        times.append(watch.lap_ms())
+    return median(times)
+
+
+def check_real_time() -> Check:
+    import resource
+
+    _, highest = resource.getrlimit(resource.RLIMIT_RTPRIO)
+    if highest == resource.RLIM_INFINITY or highest >= 80 or os.geteuid() == 0:
+        return Check("real-time rights", State.OK, "root" if os.geteuid() == 0 else f"priority up to {highest}")
+    fix = _limits_fix("rtprio 90")
+    return Check("real-time rights", State.WARN, f"priority up to {highest}: the servo loop shares its core", fix)
+
+
+def check_locked_memory() -> Check:
+    import resource
+
+    _, highest = resource.getrlimit(resource.RLIMIT_MEMLOCK)
+    if highest == resource.RLIM_INFINITY or highest >= 512e6 or os.geteuid() == 0:
+        return Check("locked memory", State.OK, "root" if os.geteuid() == 0 else "enough")
+    seen = f"{highest / 1e6:.0f} MB: the servo loop may wait for the disk"
+    return Check("locked memory", State.WARN, seen, _limits_fix("memlock unlimited"))
+
+
+def check_camera() -> Check:
+    program = (
+        "from hal.libusb import preload; preload(); import pyrealsense2 as rs; "
+        "print('; '.join(d.get_info(rs.camera_info.name) + ' ' + d.get_info(rs.camera_info.serial_number) "
+        "for d in rs.context().query_devices()))"
+    )
+    code, out = _run_python(program, timeout_s=15.0)
+    if code != 0:
+        return Check(
+            "camera", State.MISSING, _last_line(out), "not needed for the twin; see `./z1 doctor` on Linux x86"
+        )
+    if not out.strip():
+        fix = "not needed for the twin; plug the D405 into a USB 3 port and install librealsense's udev rules"
+        return Check("camera", State.MISSING, "no RealSense on USB", fix)
+    return Check("camera", State.OK, out.strip())
+
+
+def check_arm() -> Check:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect((ARM_ADDRESS, 9))  # a UDP connect sends nothing; it only looks up the route
+            ours = probe.getsockname()[0]
+        except OSError:
+            ours = "no route"
+    if not ours.startswith("192.168.123."):
+        fix = "not needed for the twin; sudo ip address add 192.168.123.162/24 dev <the arm's network port>"
+        return Check("arm", State.MISSING, f"not configured: this machine has no address near {ARM_ADDRESS}", fix)
+    if _is_there(ARM_ADDRESS):
+        return Check("arm", State.OK, f"{ARM_ADDRESS} answers, seen from {ours}")
+    return Check("arm", State.MISSING, f"{ARM_ADDRESS} does not answer", "switch the arm on; look at the cable")
+
+
+def _is_there(address: str) -> bool:
+    # A closed TCP port is an answer too. The arm's own UDP port is left alone: a datagram there could be a command.
+    with socket.socket() as probe:
+        probe.settimeout(0.5)
+        code = probe.connect_ex((address, 9))
+    return code in (0, errno.ECONNREFUSED)
+
+
+def _limits_fix(right: str) -> str:
+    return f"echo '{os.environ.get('USER', '<you>')} - {right}' | sudo tee -a {_LIMITS_FILE}, then log in again"
+
+
+def _check_port(name: str, port: int, fix: str) -> Check:
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind(("127.0.0.1", port))
+        except OSError as error:
+            return Check(name, State.MISSING, f"{port} is taken: {error.strerror}", fix)
+    return Check(name, State.OK, f"{port} is free")
+
+
+def _run_python(program: str, timeout_s: float, **environment: str) -> tuple[int, str]:
+    """Run `program` in a process of its own, as drivers may hang or end it; return exit code and output."""
+    try:
+        done = subprocess.run(
+            [sys.executable, "-P", "-c", program],
+            capture_output=True,
+            text=True,
+            timeout=timeout_s,
+            check=False,
+            env={**os.environ, **environment},
+        )
+    except subprocess.TimeoutExpired:
+        return 1, f"no answer within {timeout_s:.0f} s"
+    return done.returncode, done.stdout if done.returncode == 0 else done.stderr
+
+
+def _last_line(text: str) -> str:
+    return (text.strip().splitlines() or ["no message"])[-1][:200]

@@ -1,0 +1,140 @@
+"""Measures the grasp generator on shapes it never saw and writes `models/weights/graspgen_<gripper>.json`.
+
+    nice -n 19 python -m scripts.train.evaluate_graspgen                  # a few minutes on one core
+    python -m scripts.train.evaluate_graspgen --generator antipodal       # the sampler without learning, to compare
+
+Every grasp is checked against the true solid: the open hand touches nothing, both pads touch within the friction cone.
+`raw` is the generator's own share, `returned` and all other shares are of what `sample` gives out of `drawn` as many.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import tyro
+from rich.console import Console
+from rich.progress import track
+
+from hal.base.clock import Stopwatch
+from models.diffusion.sampler import DiffusionConfig, DiffusionSampler
+from models.diffusion.training.labels import GRIPPERS, Hand, find_grasps
+from models.diffusion.training.shapes import KNOWN_FAMILIES, UNSEEN_FAMILIES, make_shape
+from models.diffusion.training.solids import Solid
+from models.diffusion.training.views import ViewConfig, render_view
+from models.diffusion.weights import weights_path
+from models.samplers.antipodal import AntipodalConfig, AntipodalSampler
+from models.types import GraspGenerator
+from scripts.train.grasp_measures import measure_cloud, summarise
+
+CONDITIONS = {
+    "as trained": ViewConfig(occluded_share=0.0),
+    "frontal, 5° elevation": ViewConfig(frontal_share=1.0, frontal_elevation_deg=(5.0, 5.0), occluded_share=0.0),
+    "35 % occluded": ViewConfig(occluded_share=1.0, hidden=(0.35, 0.35)),
+}
+"""How the shapes are seen."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config:
+    """What to measure, and how much."""
+
+    generator: Literal["diffusion", "antipodal"] = "diffusion"
+    """Which generator."""
+    gripper: str = "agnostic"
+    """Which hand."""
+    shapes: int = 60
+    """Shapes in each set; 0 measures the time alone and writes nothing."""
+    samples: int = 800
+    """Grasps of each view."""
+    shakes: int = 4
+    """Grasps of each verdict on a view that are tried in dynamics, as trained."""
+    latency_threads: int = 2
+    """Parts side by side when the time is measured."""
+    seed: int = 900_000
+    """Seed of the first shape; far from those of the training data."""
+    out: Path | None = None
+    """Where the figures go; beside the weights if not given."""
+    diffusion: DiffusionConfig = field(default_factory=DiffusionConfig)
+
+
+def main(config: Config) -> None:
+    """Measure both sets under all conditions, print a table and write the figures."""
+    gripper = GRIPPERS[config.gripper]
+    generator: GraspGenerator
+    if config.generator == "diffusion":
+        generator = DiffusionSampler(replace(config.diffusion, gripper=config.gripper))
+    else:
+        generator = AntipodalSampler(AntipodalConfig(max_width_m=0.128))
+    console = Console()
+    report: dict = {"generator": config.generator, "shapes": config.shapes, "samples": config.samples}
+    report["latency_threads"] = config.latency_threads
+    if config.generator == "diffusion":
+        report["sampling"] = {
+            k: v for k, v in asdict(config.diffusion).items() if k in ("steps", "temperature", "drawn")
+        }
+        weights = config.diffusion.weights or weights_path(config.gripper)
+        report["weights_sha256"] = weights.with_suffix(".sha256").read_text().split()[0]
+    sets = (("known families", KNOWN_FAMILIES), ("unseen families", UNSEEN_FAMILIES)) if config.shapes else ()
+    for name, families in sets:
+        for condition, view in CONDITIONS.items():
+            clouds = [
+                measure_cloud(
+                    generator,
+                    gripper,
+                    solid,
+                    points,
+                    T_camera_object=T,
+                    samples=config.samples,
+                    shakes=config.shakes if view is CONDITIONS["as trained"] else 0,
+                )
+                for solid, points, T in track(
+                    list(draw_clouds(list(families), view, config.shapes, config.seed, gripper)),
+                    description=f"{name}, {condition}",
+                    console=console,
+                )
+            ]
+            report[f"{name}, {condition}"] = summary = summarise(clouds)
+            console.print(f"{name}, {condition}", {k: v for k, v in summary.items() if not isinstance(v, dict | list)})
+    if config.generator == "diffusion":
+        generator = DiffusionSampler(replace(config.diffusion, gripper=config.gripper, threads=config.latency_threads))
+    report["latency"] = measure_latency(generator, config.samples)
+    console.print(report["latency"])
+    if not config.shapes:
+        return
+    out = config.out or weights_path(config.gripper).with_suffix(".json")
+    out.write_text(json.dumps(report, indent=1, ensure_ascii=False) + "\n")
+
+
+def draw_clouds(
+    families: list[str], view: ViewConfig, count: int, seed: int, gripper: Hand = GRIPPERS["agnostic"]
+) -> Iterator[tuple[Solid, np.ndarray, np.ndarray]]:
+    """Yield `count` solids, families in turn, each with its visible points and T_camera_object."""
+    for index in range(count):
+        rng = np.random.default_rng(seed + index)
+        seen = None
+        while seen is None:
+            solid = make_shape(families[index % len(families)], rng)
+            if len(find_grasps(solid, gripper, rng, 400)[0]) >= 20:
+                seen = render_view(solid, view, rng)
+        yield solid, *seen
+
+
+def measure_latency(generator: GraspGenerator, samples: int) -> dict:
+    """Return the time for scored samples from 2,000 points [s]."""
+    angle, height = np.random.default_rng(0).uniform(size=(2, 2000))
+    points = np.stack([0.03 * np.cos(np.pi * angle), 0.15 * height, 0.4 - 0.03 * np.sin(np.pi * angle)], axis=1)
+    times = []
+    for seed in range(12):
+        watch = Stopwatch()
+        generator.sample(points, samples, seed)
+        times.append(1e-3 * watch.lap_ms())
+    return {"median_s": round(float(np.median(times)), 4), "max_s": round(max(times[1:]), 4)}
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Config))

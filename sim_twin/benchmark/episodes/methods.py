@@ -1,0 +1,165 @@
+"""The orders in which a method tries the very same candidates."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Literal, get_args
+
+import numpy as np
+
+from hal.base.errors import InvalidValueError
+from models.obb.mvbb import FitMethod, RankedGrasps, fit_obb, rank_by_score, rank_grasps
+from models.types import GraspSet
+from sim_twin.benchmark.episodes.seen import Seen
+from z1_runtime.grasping.ranking import Ranking, ScoringHead, load_scoring
+from z1_runtime.tasks.grasp_selection import Decider, StageTimes
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Method:
+    """How candidates are filtered and ranked; what is None is as the configuration has it."""
+
+    name: str
+    """As the reports call it."""
+    rank_by: Literal["score", "box", "full"]
+    """The generator's score; the paper's MVBB; or all that the runtime knows."""
+    collision_filter: bool = True
+    """Whether grasps that hit the point cloud are dropped before the ranking; `full` looks for itself."""
+    box: FitMethod | None = None
+    """How the box is fitted."""
+    k: int | None = None
+    """Faces that may be approached."""
+    alpha: float | None = None
+    """Weight of the alignment."""
+    hard_filter: bool | None = None
+    """Whether grasps with a_j ≤ 0 are dropped; without it they only rank low."""
+    min_alignment: float | None = None
+    """Grasps less aligned come last."""
+    min_score: float | None = None
+    """So do those to which the generator gave less."""
+    head: ScoringHead | None = None
+    """What orders the grasps instead of α, or instead of the runtime's weights."""
+
+    def ranking(self, configured: Ranking) -> Ranking:
+        """Return the numbers it ranks by; those it does not say itself are `configured`."""
+        own = {
+            "box_method": self.box,
+            "k_faces": self.k,
+            "alpha": self.alpha,
+            "hard_filter": self.hard_filter,
+            "min_alignment": self.min_alignment,
+            "min_score": self.min_score,
+            "head": self.head,
+        }
+        return replace(configured, **{name: value for name, value in own.items() if value is not None})
+
+    def order(self, seen: Seen, decider: Decider, times: StageTimes) -> tuple[RankedGrasps, np.ndarray]:
+        """Return the candidates in the order to try them, and which (M,) were left before the ranking.
+
+        The ranking's own indices count in those that were left.
+
+        Args:
+            seen: the look, with its candidates.
+            decider: whose kinematics, gripper and box settings are used.
+            times: gets the stages `filter` (of collisions) and `rank` (fit, filter by the box, score).
+
+        Raises:
+            DegenerateCloudError: the object's cloud spans no box.
+            NoPlanError: `full` keeps none.
+        """
+        left = np.arange(len(seen.candidates))
+        if self.rank_by != "full" and self.collision_filter:
+            left = np.flatnonzero(seen.free(decider, times))
+        with times.stage("rank"):
+            return self._rank(seen.candidates[left], seen, decider), left
+
+    def _rank(self, candidates: GraspSet, seen: Seen, decider: Decider) -> RankedGrasps:
+        if self.rank_by == "full":
+            return decider.rank(candidates, seen.observation, self.ranking(decider.ranking))
+        if self.rank_by == "score":
+            return rank_by_score(candidates)
+        return _rank_by_box(candidates, seen, decider, self.ranking(Ranking()))
+
+
+def _rank_by_box(candidates: GraspSet, seen: Seen, decider: Decider, ranking: Ranking) -> RankedGrasps:
+    """Return the paper's order, or with a head the head's; what is below a threshold comes last."""
+    observation = seen.observation
+    box = fit_obb(observation.object_points, ranking.box_method, up=observation.T_base_camera[2, :3])
+    ranked = rank_grasps(candidates, box, k=ranking.k_faces, alpha=ranking.alpha, hard_filter=ranking.hard_filter)
+    scores = ranked.scores
+    if ranking.head is not None and len(ranked):
+        scores = ranking.head.probability(decider.planner.features(ranked.grasps, observation))
+    wanted = ranking.wanted(ranked.alignments, ranked.grasps.scores)
+    return ranked.reordered(np.where(wanted, scores, scores - _BEHIND))
+
+
+_BEHIND = 2.0
+"""More than two scores can differ by."""
+METHODS = {
+    "vanilla": Method(name="vanilla", rank_by="score"),
+    "mvb": Method(name="mvb", rank_by="box", box="pca", k=2, alpha=0.85, hard_filter=True),
+    "full": Method(name="full", rank_by="full"),
+}
+"""`vanilla` and `mvb` are the paper's; `full` is the runtime's own."""
+_NUMBERS = {"k": int, "alpha": float, "min_alignment": float, "min_score": float}
+_OF_BOX = (*_NUMBERS, "box", "hard_filter", "scoring")
+_SETTINGS = {"vanilla": ("collision_filter",), "mvb": (*_OF_BOX, "collision_filter"), "full": _OF_BOX}
+"""What can be changed, by method."""
+
+
+def file_name(method: str) -> str:
+    """Return the name of a method without what a file's name cannot hold."""
+    return "".join(letter if letter.isalnum() or letter in ".-_" else "_" for letter in method)
+
+
+def parse_method(text: str) -> Method:
+    """Return the method that `text` names: `mvb`, or with settings `mvb:k=3,alpha=0.5,box=upright,hard_filter=no`.
+
+    `scoring=FILE` takes all numbers from a file of `./z1 tune`; further settings go over them.
+
+    Raises:
+        ValueError: no such method or setting.
+        ScoringError: the file cannot be used.
+    """
+    name, _, settings = text.partition(":")
+    if name not in METHODS:
+        raise InvalidValueError(f"there is no method {name!r}; known: {', '.join(METHODS)}.")
+    changes: dict[str, object] = {}
+    for setting in filter(None, settings.split(",")):
+        key, _, value = setting.partition("=")
+        if key not in _SETTINGS[name]:
+            raise InvalidValueError(
+                f"method {text!r} has an unknown setting {key!r}; known: {', '.join(_SETTINGS[name])}."
+            )
+        if key == "scoring":
+            changes = {**_from_file(name, Path(value)), **changes}
+        else:
+            changes[key] = _converted(text, key, value)
+    method = replace(METHODS[name], name=text, **changes)  # pyright: ignore[reportArgumentType]
+    try:
+        method.ranking(Ranking())
+    except ValueError as error:
+        raise InvalidValueError(f"method {text!r}: {error}") from error
+    return method
+
+
+def _from_file(name: str, path: Path) -> dict[str, object]:
+    ranking = getattr(load_scoring(path), name)
+    values = {each.name: getattr(ranking, each.name) for each in fields(Ranking)}
+    return {"box": values.pop("box_method"), "k": values.pop("k_faces"), **values}
+
+
+def _converted(text: str, key: str, value: str) -> object:
+    if key in ("hard_filter", "collision_filter"):
+        if value not in ("yes", "no"):
+            raise InvalidValueError(f"method {text!r}: {key} is {value!r}; say yes or no.")
+        return value == "yes"
+    if key == "box":
+        if value not in get_args(FitMethod):
+            raise InvalidValueError(f"method {text!r}: box is {value!r}; allowed: {', '.join(get_args(FitMethod))}.")
+        return value
+    try:
+        return _NUMBERS[key](value)
+    except ValueError as error:
+        raise InvalidValueError(f"method {text!r}: {key} is {value!r}, which is no number.") from error

@@ -1,0 +1,160 @@
+"""One episode as a line of a table: what it was, what was seen and chosen, and how it ended."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from functools import cache
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+
+from models.obb.mvbb import RankedGrasps
+from sim_twin.benchmark.episodes.scenarios import Scenario
+from sim_twin.benchmark.episodes.seen import Seen
+from sim_twin.benchmark.episodes.targeting import overlap
+from sim_twin.benchmark.episodes.trial import Mode, Outcome
+from z1_runtime.grasping.features import FEATURES
+from z1_runtime.tasks.grasp_selection import StageTimes
+from z1_runtime.types import GraspPlan, Rejection
+
+Row = dict[str, Any]
+"""One episode: column to value, as `make_row` says. A column that does not apply is missing, in the table None."""
+
+REASONS = ("width", "table", "scene", "object", "self", "ik", "path")
+"""For which the planner refuses a candidate; each has a column `rejected_…`."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Attempt:
+    """One look and what came of it, as far as it came."""
+
+    times: StageTimes
+    outcome: Outcome | None = None
+    """None while it has a plan that was not executed."""
+    seen: Seen | None = None
+    ranked: RankedGrasps | None = None
+    left: np.ndarray | None = None
+    """(M,) candidates left before the ranking, whose indices count in these."""
+    plan: GraspPlan | None = None
+    rejections: Sequence[Rejection] = ()
+    features: np.ndarray | None = None
+    """(2, 11) of `z1_runtime.grasping.features.FEATURES`, of the first-ranked and, if there is a plan, of the executed
+    grasp."""
+
+    @property
+    def ended(self) -> Outcome:
+        """How it ended; only once it has."""
+        assert self.outcome is not None, "this attempt was not executed"
+        return self.outcome
+
+
+def make_row(
+    scenario: Scenario,
+    method: str,
+    attempts: Sequence[Attempt],
+    *,
+    top_k: int = 1,
+    given_up: str = "",
+    qpos: np.ndarray | None = None,
+) -> Row:
+    """Return the row of one method's episode.
+
+    What a look, a decision and its outcome are told by is that of the last attempt; `success_top1` is of the first.
+
+    Args:
+        scenario: `object`, `distance`, …, and the physics and neighbours that were drawn for it.
+        method: its name.
+        attempts: one or more; `attempts`, `modes` and `ranks` tell of each, `success_after` (top_k,) whether the object
+            was lifted within one, two, … of them.
+        top_k: how many there might have been.
+        given_up: why there were no more, if that was not for success or their number.
+        qpos: MuJoCo's positions at the end; None where nothing moved.
+    """
+    first, last = attempts[0], attempts[-1]
+    success = last.ended.mode is Mode.SUCCESS
+    row: Row = {**scenario.features(), "method": method, "version": _version()}
+    row |= {"success": success, "success_top1": _is_top1(first)}
+    row |= {
+        "top_k": top_k,
+        "attempts": len(attempts),
+        "modes": [attempt.ended.mode.value for attempt in attempts],
+        "ranks": [-1 if attempt.plan is None else attempt.plan.rank for attempt in attempts],
+        "success_after": [success and len(attempts) <= k for k in range(1, top_k + 1)],
+        "given_up": given_up,
+    }
+    row |= asdict(last.ended) | {"mode": last.ended.mode.value}
+    row |= {f"{stage}_ms": ms for stage, ms in last.times.ms.items()}
+    reasons = Counter(rejection.reason for rejection in last.rejections)
+    row |= {f"rejected_{reason}": reasons[reason] for reason in REASONS}
+    row |= _of_look(last.seen) | _of_ranking(last) | _of_plan(last) | _of_features(last)
+    return row if qpos is None else row | {"final_qpos": qpos.tolist()}
+
+
+def _is_top1(attempt: Attempt) -> bool:
+    return attempt.ended.mode is Mode.SUCCESS and attempt.plan is not None and attempt.plan.rank == 0
+
+
+@cache
+def _version() -> str:
+    return version("z1-grasp")
+
+
+def _of_look(seen: Seen | None) -> Row:
+    if seen is None:
+        return {}
+    detection, truth = seen.observation.detection, seen.frame.truth_mask
+    return {
+        "n_object_points": len(seen.observation.object_points),
+        "n_candidates": len(seen.candidates),
+        "detection_label": detection.label,
+        "detection_confidence": detection.confidence,
+        "iou": float("nan") if truth is None else overlap(detection, truth),
+    }
+
+
+def _of_ranking(attempt: Attempt) -> Row:
+    ranked, seen, left = attempt.ranked, attempt.seen, attempt.left
+    if ranked is None or seen is None or left is None:
+        return {}
+    row: Row = {"n_free": len(left), "n_ranked": len(ranked)}
+    if ranked.box is not None:
+        normals = ranked.box.face_normals[ranked.faces] @ seen.observation.T_base_camera[:3, :3].T
+        row |= {"box_extents_m": ranked.box.extents_m.tolist(), "faces": ranked.faces.tolist()}
+        row |= {"face_normals": normals.ravel().tolist()}
+    return row
+
+
+def _of_plan(attempt: Attempt) -> Row:
+    plan, ranked, left = attempt.plan, attempt.ranked, attempt.left
+    if plan is None or ranked is None or left is None:
+        return {}
+    return {
+        "rank": plan.rank,
+        "alignment": float(ranked.alignments[plan.rank]),
+        "rank_score": float(ranked.scores[plan.rank]),
+        "generator_score": float(ranked.grasps.scores[plan.rank]),
+        "candidate": int(left[ranked.indices[plan.rank]]),
+        "width_m": plan.width_m,
+        "jaw_open": plan.jaw_open,
+        "ik_method": plan.ik_method,
+        "T_base_grasp": plan.T_base_grasp.ravel().tolist(),
+        "T_base_pivot": plan.T_base_pivot.ravel().tolist(),
+    }
+
+
+def _of_features(attempt: Attempt) -> Row:
+    """Return what a scoring head is fitted to: of the first-ranked grasp `first_…`, of the executed one `grasp_…`."""
+    ranked, left, features = attempt.ranked, attempt.left, attempt.features
+    if ranked is None or left is None or features is None:
+        return {}
+    row: Row = {
+        "first_candidate": int(left[ranked.indices[0]]),
+        "first_box_alignment": float(ranked.alignments[0]),
+    }
+    row |= {f"first_{name}": float(value) for name, value in zip(FEATURES, features[0], strict=True)}
+    if attempt.plan is not None:
+        row |= {f"grasp_{name}": float(value) for name, value in zip(FEATURES, features[1], strict=True)}
+    return row

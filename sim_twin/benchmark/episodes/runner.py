@@ -1,0 +1,151 @@
+"""Runs scenarios side by side and hands over every row as it comes."""
+
+from __future__ import annotations
+
+import logging
+import multiprocessing
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Executor, ProcessPoolExecutor, wait
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import cache
+from itertools import islice
+from typing import TYPE_CHECKING, TypeVar
+
+from sim_twin.benchmark.episodes.episode import run_scenario
+from sim_twin.benchmark.episodes.methods import Method
+from sim_twin.benchmark.episodes.recordings import Recordings
+from sim_twin.benchmark.episodes.rows import Row
+from sim_twin.benchmark.episodes.scenarios import Scenario
+from sim_twin.benchmark.episodes.targeting import aim
+from z1_runtime.config import RuntimeConfig
+
+if TYPE_CHECKING:
+    from z1_runtime.tasks.grasp_selection import Decider
+
+T = TypeVar("T")
+
+ONE_THREAD = {name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")}
+"""Environment of a process that shall keep to one core: the workers themselves fill the machine."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Task:
+    """One scenario for some methods."""
+
+    scenario: Scenario
+    methods: tuple[Method, ...]
+    config: RuntimeConfig
+    top_k: int = 1
+    recordings: Recordings | None = None
+
+
+def make_tasks(
+    scenarios: Sequence[Scenario],
+    methods: Sequence[Method],
+    config: RuntimeConfig,
+    done: set[tuple[str, str]],
+    *,
+    top_k: int = 1,
+    recordings: Recordings | None = None,
+) -> list[Task]:
+    """Return what is left to do: methods of a scenario that are done are left out."""
+    tasks = []
+    for scenario in scenarios:
+        left = tuple(method for method in methods if (scenario.key, method.name) not in done)
+        if left:
+            tasks.append(Task(scenario=scenario, methods=left, config=config, top_k=top_k, recordings=recordings))
+    return tasks
+
+
+def run_task(task: Task) -> list[Row]:
+    """Return the rows of one task; what it needs is built once in each process."""
+    logging.getLogger("z1_runtime.tasks.grasp_selection").setLevel(
+        logging.ERROR
+    )  # a camera off its mount is what is tried here
+
+    def decider(scenario: Scenario, seed: int) -> Decider:
+        return make_decider(task.config, scenario, seed)
+
+    return run_scenario(task.scenario, task.methods, decider, top_k=task.top_k, recordings=task.recordings)
+
+
+def run_tasks(tasks: Sequence[T], jobs: int, run: Callable[[T], list[Row]] = run_task) -> Iterator[list[Row]]:
+    """Yield the rows of each task as it ends, in any order; `jobs` processes share them.
+
+    A row does not depend on `jobs`, nor on which process made it: each scenario has its own seeds.
+
+    Args:
+        tasks: what `run` takes; they are sent to the processes.
+        jobs: how many processes.
+        run: does one task; a function of a module, which the processes import.
+    """
+    # A fresh interpreter for each: forked ones would share OpenGL and torch with this one.
+    context = multiprocessing.get_context("spawn")
+    jobs = min(jobs, max(len(tasks), 1))
+    with environment(ONE_THREAD), ProcessPoolExecutor(jobs, mp_context=context, initializer=one_thread) as pool:
+        yield from _in_order_of_ending(pool, tasks, 2 * jobs, run)
+
+
+def _in_order_of_ending(
+    pool: Executor, tasks: Sequence[T], ahead: int, run: Callable[[T], list[Row]]
+) -> Iterator[list[Row]]:
+    waiting = iter(tasks)
+    running = {pool.submit(run, task) for task in islice(waiting, ahead)}
+    while running:
+        ended, running = wait(running, return_when=FIRST_COMPLETED)
+        for future in ended:
+            running |= {pool.submit(run, task) for task in islice(waiting, 1)}
+            yield future.result()
+
+
+@contextmanager
+def environment(variables: Mapping[str, str]) -> Iterator[None]:
+    """Set environment variables while the body runs: a child reads them before it can be told anything."""
+    before = {name: os.environ.get(name) for name in variables}
+    os.environ.update(variables)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+def one_thread() -> None:
+    """Keep what heeds no variable to one thread too."""
+    import cv2
+
+    cv2.setNumThreads(1)
+
+
+def make_decider(config: RuntimeConfig, scenario: Scenario, seed: int) -> Decider:
+    """Return the runtime's decider under `config`, told which object `scenario` means, with the generator's `seed`."""
+    from z1_runtime.perception.segmentation import Perception
+    from z1_runtime.tasks.grasp_selection import Decider
+
+    base = _assembled(replace(config, seed=0))
+    config, detector = aim(replace(config, seed=seed), base.perception.detector, scenario)
+    perception = base.perception
+    if detector is not perception.detector:
+        perception = Perception(config.perception, detector, base.T_flange_camera)
+    return Decider(
+        kinematics=base.kinematics,
+        perception=perception,
+        generator=base.generator,
+        planner=base.planner,
+        config=config,
+        T_flange_camera=base.T_flange_camera,
+    )
+
+
+@cache
+def _assembled(config: RuntimeConfig) -> Decider:
+    from z1_runtime.factory import make_decider
+
+    decider = make_decider(config)
+    decider.warm_up()
+    return decider

@@ -1,0 +1,65 @@
+"""What all methods share of one look at a scene: they rank the very same candidates."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hal.base.messages import RgbdFrame
+from models.types import GraspSet
+from z1_runtime.collision.scene_collision import CollisionChecker
+from z1_runtime.grasping.grasp_candidates import Candidates
+from z1_runtime.tasks.grasp_selection import Decider, StageTimes
+from z1_runtime.types import Observation
+
+
+class Seen:
+    """A frame, what perception made of it, and what the generator proposed.
+
+    Args:
+        frame: as the camera gave it.
+        q: (7,) joints it was taken at [rad].
+        observation: clouds and table.
+        candidates: camera frame.
+        times: of detect, cloud and generate.
+    """
+
+    def __init__(
+        self, frame: RgbdFrame, q: np.ndarray, observation: Observation, candidates: GraspSet, times: StageTimes
+    ) -> None:
+        self.frame, self.q = frame, q
+        self.observation, self.candidates = observation, candidates
+        self.times = times
+        self._free: np.ndarray | None = None
+        self._filter_times = StageTimes()
+
+    @classmethod
+    def by(cls, decider: Decider, frame: RgbdFrame, q: np.ndarray, times: StageTimes) -> Seen:
+        """Return what `decider` sees in `frame`, taken at joints `q` (7,), and proposes for it; `times` gets the time.
+
+        Raises:
+            PerceptionError: nothing usable was seen.
+            ValueError: the generator can make nothing of the cloud.
+        """
+        observation = decider.observe(frame, q, times)
+        with times.stage("generate"):
+            candidates = decider.propose(observation)
+        return cls(frame, q, observation, candidates, times)
+
+    def free(self, decider: Decider, times: StageTimes) -> np.ndarray:
+        """Return (N,) which candidates the beak can be laid around without hitting a point that was seen.
+
+        It is computed for the first method that asks, and its time is told to each: `times` gets the stage `filter`.
+        """
+        if self._free is None:
+            with self._filter_times.stage("filter"):
+                planner = decider.planner
+                checker = CollisionChecker(decider.kinematics, self.observation, self.q, planner.config.collision)
+                self._free = Candidates(
+                    self.candidates,
+                    self.observation.T_base_camera,
+                    planner.gripper,
+                    checker,
+                    fallback_width_m=planner.config.fallback_width_m,
+                ).free()
+        times.ms |= self._filter_times.ms
+        return self._free

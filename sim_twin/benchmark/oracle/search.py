@@ -1,0 +1,167 @@
+"""What can be solved at all: grasps swept over the true object, and the best of each kind executed until one holds.
+
+The oracle sees no picture: it is told the object's shape and pose. Whatever passes the planner's own checks against the
+true scene is executed in a fresh world, one grasp after the other, each as unlike the failed ones as can be.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field
+from functools import cache
+from importlib.metadata import version
+
+from hal.base.clock import Stopwatch
+from hal.base.errors import InvalidValueError
+from sim_twin.benchmark.episodes.rows import REASONS, Row
+from sim_twin.benchmark.episodes.scenarios import Scenario
+from sim_twin.benchmark.episodes.trial import Mode, Outcome, Robot
+from sim_twin.benchmark.oracle.candidates import SweepConfig
+from sim_twin.benchmark.oracle.options import EXACT_PLANNER, Options, TrueScene
+from z1_runtime.geometry.kinematics import Kinematics
+from z1_runtime.planning.pick_motion import Refused
+from z1_runtime.planning.planner_config import PlannerConfig
+from z1_runtime.types import GraspPlan
+
+METHOD = "oracle"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OracleConfig:
+    """How long to search."""
+
+    executions: int = 40
+    """Grasps that are executed, each in a fresh world, before a scenario counts as not solved."""
+    plannings: int = 600
+    """Grasps whose motion is planned before then."""
+    finer_after: int = 12
+    """Failed executions after which the finer sweep is made."""
+    sweep: SweepConfig = field(default_factory=SweepConfig)
+    """The sweep that is counted, and tried first."""
+    finer: SweepConfig = field(
+        default_factory=lambda: SweepConfig(
+            n_points=900, n_approaches=24, depths_m=(0.0, 0.008), cell_m=0.010, cell_sine=0.3, seed=1
+        )
+    )
+    """The sweep that follows where all of the first fails."""
+    planner: PlannerConfig = EXACT_PLANNER
+    """What is a collision where everything is known exactly."""
+    speed: float = 0.5
+    """Fraction of the arm's limits that motions use."""
+
+    def __post_init__(self) -> None:
+        if min(self.executions, self.plannings, self.finer_after) < 1:
+            raise InvalidValueError(
+                "executions, plannings and finer_after are "
+                f"{self.executions}, {self.plannings} and {self.finer_after}; each must be 1 or more."
+            )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OracleTask:
+    """One scenario to be searched."""
+
+    scenario: Scenario
+    config: OracleConfig
+
+
+def run_oracle_task(task: OracleTask) -> list[Row]:
+    """Return the row of one scenario, as a list of one."""
+    return [search(task.scenario, task.config)]
+
+
+def search(scenario: Scenario, config: OracleConfig) -> Row:
+    """Look for a grasp that lifts the object of `scenario`; return what was found, as a table's row.
+
+    `success` says whether one did, `verdict` how the search ended: `solved`; `unsolved`, all that was executed failed;
+    `unreachable`, nothing can be executed. `executions` counts, `modes` names them in turn, and what else is told is
+    of the last one. `n_candidates`, `n_clear` and `n_reachable` are of the first sweep: the grasps, those with room for
+    the gripper, and the ways to lay it (two a grasp) that the arm can go.
+    """
+    watch = Stopwatch()
+    hunt = _Hunt(scenario, config)
+    for _ in hunt.run():
+        pass
+    row: Row = {**scenario.features(), "method": METHOD, "version": version("z1-grasp")}
+    return row | hunt.report() | {"search_ms": watch.lap_ms()}
+
+
+class _Hunt:
+    """One scenario's search."""
+
+    def __init__(self, scenario: Scenario, config: OracleConfig) -> None:
+        self._scene, self._config = scenario.scene(), config
+        self._truth = TrueScene(self._scene, _kinematics(), config.planner, config.speed)
+        self._counted: Options | None = None
+        self._modes: list[Mode] = []
+        self._refused: Counter[str] = Counter()
+        self._last: tuple[GraspPlan, Outcome] | None = None
+        self._exhausted = False
+
+    def run(self) -> Iterator[Outcome]:
+        """Yield the outcome of each execution; end with the first success, or when options or budget are spent."""
+        options = self._counted = self._truth.options(self._config.sweep)
+        finer = False
+        while not self._is_over():
+            choice = None if not finer and len(self._modes) >= self._config.finer_after else options.next()
+            if choice is None and finer:
+                self._exhausted = True
+                return
+            if choice is None:
+                options, finer = options.joined(self._truth.options(self._config.finer)), True
+                continue
+            try:
+                plan = self._truth.plan(choice)
+            except Refused as refusal:
+                self._refused[refusal.reason] += 1
+                options.fail(choice)
+                continue
+            outcome = self._execute(plan)
+            options.fail(choice)
+            yield outcome
+
+    def _is_over(self) -> bool:
+        config = self._config
+        solved = bool(self._modes) and self._modes[-1] is Mode.SUCCESS
+        return solved or len(self._modes) >= config.executions or self._refused.total() >= config.plannings
+
+    def _execute(self, plan: GraspPlan) -> Outcome:
+        with Robot(self._scene, self._truth.kinematics, self._config.speed) as robot:
+            outcome = robot.act(plan)
+        self._modes.append(outcome.mode)
+        self._last = plan, outcome
+        return outcome
+
+    def report(self) -> Row:
+        """Return what was found as columns."""
+        counted = self._counted
+        assert counted is not None, "nothing was searched"
+        success = bool(self._modes) and self._modes[-1] is Mode.SUCCESS
+        row: Row = {
+            "success": success,
+            "verdict": "solved" if success else "unsolved" if self._modes else "unreachable",
+            "exhausted": self._exhausted,
+            "executions": len(self._modes),
+            "modes": [mode.value for mode in self._modes],
+            "n_candidates": counted.n_candidates,
+            "n_clear": counted.n_clear,
+            "n_reachable": len(counted),
+        }
+        row |= {f"rejected_{reason}": counted.rejected[reason] + self._refused[reason] for reason in REASONS}
+        if self._last is None:
+            return row
+        plan, outcome = self._last
+        row |= asdict(outcome) | {"mode": outcome.mode.value}
+        return row | {
+            "width_m": plan.width_m,
+            "jaw_open": plan.jaw_open,
+            "T_base_grasp": plan.T_base_grasp.ravel().tolist(),
+            "T_base_pivot": plan.T_base_pivot.ravel().tolist(),
+        }
+
+
+@cache
+def _kinematics() -> Kinematics:
+    """Return one arm's kinematics for all scenarios of this process."""
+    return Kinematics()

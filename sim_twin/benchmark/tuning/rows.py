@@ -1,0 +1,180 @@
+"""What `./z1 tune` reads: the rows of benchmark runs, and the grasps in them whose outcome is known."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from hal.base.errors import UsageError
+from sim_twin.benchmark.episodes.rows import Row
+from sim_twin.benchmark.results.store import FOLDER, TABLE
+from z1_runtime.config import RuntimeConfig, config_from
+from z1_runtime.grasping.features import FEATURES
+
+Reading = Literal["top1", "fallthrough"]
+"""`top1`: the first-ranked grasp counts alone; `fallthrough`: the first that the arm can do is executed."""
+Outcomes = dict[str, dict[str, bool]]
+"""By method and scenario, whether it succeeded."""
+
+
+class TuneError(UsageError):
+    """Rows that nothing can be learned from, or that do not belong together."""
+
+    default_code = "tune"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Logs:
+    """The rows of some runs under the same settings."""
+
+    rows: list[Row]
+    config: RuntimeConfig
+    """What they were run with."""
+    sources: tuple[str, ...]
+
+    @property
+    def seeds(self) -> tuple[int, ...]:
+        """Return the seeds, in order."""
+        return tuple(sorted({row["seed"] for row in self.rows}))
+
+
+def read_logs(folders: Sequence[Path]) -> Logs:
+    """Return the rows of benchmark runs, each scenario and method once.
+
+    Args:
+        folders: the `--out` of `./z1 bench`.
+
+    Raises:
+        TuneError: no rows, no settings, or runs with different settings.
+        ConfigError: the settings are of a version that this one cannot read.
+    """
+    rows: dict[tuple[str, str], Row] = {}
+    configs: dict[str, RuntimeConfig] = {}
+    for folder in folders:
+        configs[str(folder)] = _settings(folder)
+        for row in _rows(folder):
+            rows.setdefault((row["scenario"], row["method"]), row)
+    if not rows:
+        raise TuneError("no folder was given, or none holds episodes; give the --out of a `./z1 bench`.")
+    first, config = next(iter(configs.items()))
+    for other, settings in configs.items():
+        if settings != config:
+            raise TuneError(f"{first} and {other} were run with different settings; tune on runs with the same ones.")
+    ordered = [rows[key] for key in sorted(rows)]
+    return Logs(rows=ordered, config=config, sources=tuple(configs))
+
+
+def _settings(folder: Path) -> RuntimeConfig:
+    path = folder / "summary.json"
+    try:
+        settings = json.loads(path.read_text(encoding="utf-8"))["run"]["settings"]
+    except (OSError, KeyError, json.JSONDecodeError) as error:
+        raise TuneError(
+            f"{path} does not say with which settings the episodes were run; give the --out of a `./z1 bench` that "
+            "came to its end."
+        ) from error
+    return config_from(settings, f"{path}: settings")
+
+
+def _rows(folder: Path) -> list[Row]:
+    """Return a run's rows, from its one table, or while it still runs from the folder of small ones."""
+    table = folder / TABLE
+    paths = [table] if table.exists() else sorted((folder / FOLDER).glob("*.parquet"))
+    if not paths:
+        raise TuneError(f"{folder} holds no episodes; give the --out of a `./z1 bench`.")
+    return pa.concat_tables([pq.read_table(path) for path in paths], promote_options="permissive").to_pylist()
+
+
+def pose_of(row: Mapping[str, Any]) -> str:
+    """Return the scenario of a row without its seed: what may not stand on both sides of a cross-validation."""
+    return row["scenario"].rpartition("-s")[0]
+
+
+def worked(row: Mapping[str, Any], reading: Reading) -> bool:
+    """Return whether the first attempt of an episode succeeded."""
+    if reading == "top1":
+        return bool(row["success_top1"])
+    after = row.get("success_after")
+    return bool(after[0]) if after else bool(row["success"])
+
+
+def outcomes(rows: Iterable[Row], reading: Reading) -> Outcomes:
+    """Return who succeeded where."""
+    by_method: Outcomes = {}
+    for row in rows:
+        by_method.setdefault(row["method"], {})[row["scenario"]] = worked(row, reading)
+    return by_method
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Samples:
+    """N grasps whose outcome is known, none twice."""
+
+    measured: np.ndarray
+    """(N, 11) as `z1_runtime.grasping.features.measure` returns it."""
+    worked: np.ndarray
+    """(N,) bool."""
+    poses: np.ndarray
+    """(N,) the scenarios without their seeds."""
+    objects: np.ndarray
+    """(N,) names."""
+
+    def __len__(self) -> int:
+        return len(self.worked)
+
+    def __getitem__(self, index: np.ndarray) -> Samples:
+        return Samples(
+            measured=self.measured[index],
+            worked=self.worked[index],
+            poses=self.poses[index],
+            objects=self.objects[index],
+        )
+
+
+Which = Literal["first", "grasp"]
+"""The first-ranked grasp of an episode, or the executed one; a row's columns begin so."""
+
+
+def known_grasps(rows: Iterable[Row], reading: Reading) -> Iterator[tuple[Row, Which, bool]]:
+    """Yield each grasp whose outcome is known: its row, which of the row's grasps it is, and whether it worked.
+
+    An executed grasp worked if its episode did. Under `top1` a first-ranked grasp that was passed over, since the arm
+    could not do it, is one that did not work; under `fallthrough` passing it over costs nothing, so it is left out.
+    Methods that chose the same grasp give one. Rows with retries are passed over: they tell of the last attempt.
+    """
+    found: set[tuple[str, int | None]] = set()
+    for row in rows:
+        if row.get("attempts", 1) != 1:
+            continue
+        first, grasp = (row["scenario"], row.get("first_candidate")), (row["scenario"], row.get("candidate"))
+        if reading == "top1" and row.get("rank") != 0 and first[1] is not None and first not in found:
+            found.add(first)
+            yield row, "first", False
+        if grasp[1] is not None and grasp not in found:
+            found.add(grasp)
+            yield row, "grasp", bool(row["success"])
+
+
+def samples_of(rows: Iterable[Row], reading: Reading) -> Samples:
+    """Return the known grasps of `rows` with what was measured of them; rows of earlier versions have no such columns
+    and are passed over."""
+    known = [(row, _features(row, which), right) for row, which, right in known_grasps(rows, reading)]
+    known = [(row, measured, right) for row, measured, right in known if measured is not None]
+    return Samples(
+        measured=np.array([measured for _, measured, _ in known], dtype=float).reshape(-1, len(FEATURES)),
+        worked=np.array([right for *_, right in known], dtype=bool),
+        poses=np.array([pose_of(row) for row, *_ in known], dtype=str),
+        objects=np.array([row["object"] for row, *_ in known], dtype=str),
+    )
+
+
+def _features(row: Row, which: Which) -> list[float] | None:
+    values = [row.get(f"{which}_{name}") for name in FEATURES]
+    return None if any(value is None for value in values) else [float(value) for value in values]  # pyright: ignore[reportArgumentType]

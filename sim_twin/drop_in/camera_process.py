@@ -1,0 +1,132 @@
+"""The twin's optics in a process of their own: drawing in software holds no lock that the arm waits for."""
+
+from __future__ import annotations
+
+import os
+from multiprocessing.connection import Connection
+
+import mujoco
+import numpy as np
+
+from hal.base.clock import Clock, WallClock
+from hal.base.d405 import MIN_Z_M, Calibration, Exposure, Look
+from sim_twin.drop_in.child_process import ChildProcess
+from sim_twin.drop_in.process import WireProcess, load_model
+from sim_twin.drop_in.shared_memory import SharedWorld, make_memory, map_memory
+from sim_twin.model.scene import SceneConfig
+from sim_twin.model.scene_view import SceneView
+
+_IMAGES = ("depth", "colour", "left", "right")
+_MOST_PIXELS = max(width * height for width, height in MIN_Z_M)
+_FRAME = np.dtype(
+    [(name, "<u2" if name == "depth" else "u1", (_MOST_PIXELS * (1 if name == "depth" else 3),)) for name in _IMAGES]
+)
+
+
+class RemoteSource:
+    """`hal.base.d405.FrameSource` of a world in another process, drawn in a third, by the wall clock.
+
+    Args:
+        twin: what it looks at.
+        calibration: of the unit; by default figures of real ones.
+    """
+
+    lockstep = False
+
+    def __init__(self, twin: WireProcess, calibration: Calibration | None = None) -> None:
+        self.clock: Clock = WallClock()
+        self.calibration = calibration if calibration is not None else Calibration()
+        self.attached = True
+        """Set it to False to pull the cable."""
+        self.world = twin
+        self._child: ChildProcess | None = None
+        self._memory = make_memory(_FRAME.itemsize)
+        self._frame = map_memory(self._memory, _FRAME)
+
+    def start(self) -> None:
+        """Let the process begin, and wait until it can draw. Harmless when it has begun.
+
+        Raises:
+            HalError: it could not begin; the message is its own.
+        """
+        if self._child is not None:
+            return
+        twin = self.world
+        files = (twin.memory, twin.model_file, self._memory)
+        child = ChildProcess(
+            "sim_twin.drop_in.camera_process:serve", (twin.config, self.calibration, files), files, "the twin's camera"
+        )
+        child.wait_ready()
+        self._child = child
+
+    def expose(self, look: Look) -> Exposure:
+        """Return what the imagers see now.
+
+        Raises:
+            CameraError: the renderer asked for cannot be had.
+            HalError: one of the two processes has ended.
+        """
+        self.start()
+        assert self._child is not None
+        stamp_s, present = self._child.ask(look)
+        images = {name: _image(self._frame, name, look).copy() for name in present}
+        return Exposure(number=look.number, stamp_s=stamp_s, **images)
+
+    def warm_up(self, width: int = 848, height: int = 480) -> None:
+        """Start the process and draw once, so that the first frame is as quick as the others."""
+        self.expose(Look(number=0, width=width, height=height, depth=True, colour=True))
+
+    def reset(self) -> None:
+        """Nothing hangs in here."""
+
+    def close(self) -> None:
+        """End the process until the next `expose`."""
+        child, self._child = self._child, None
+        if child is not None:
+            child.close()
+
+    def __del__(self) -> None:
+        os.close(self._memory)
+
+
+class _SharedView(SceneView):
+    """The scene in the memory that its world publishes into."""
+
+    def __init__(self, config: SceneConfig, shared: SharedWorld, model: mujoco.MjModel) -> None:
+        super().__init__(config)
+        self._shared, self._model = shared, model
+        self.start_height_m = shared.start_height_m
+
+    @property
+    def model(self) -> mujoco.MjModel:
+        return self._model
+
+    def poses(self) -> tuple[float, np.ndarray]:
+        return self._shared.read()
+
+
+def serve(connection: Connection, scene: SceneConfig, calibration: Calibration, files: tuple[int, int, int]) -> None:
+    """Be the third process: draw what is asked for until the connection is closed.
+
+    Raises:
+        CameraError: the renderer asked for cannot be had.
+    """
+    from sim_twin.drop_in.realsense_source import TwinSource  # drawing and noise are this process's to load
+
+    world, model, frames = files
+    view, frame = _SharedView(scene, SharedWorld(world), load_model(model)), map_memory(frames, _FRAME)
+    with TwinSource(view, WallClock(), calibration=calibration, gives_way=False) as source:
+        connection.send(None)
+        while True:
+            look = connection.recv()
+            exposure = source.expose(look)
+            present = [name for name in _IMAGES if getattr(exposure, name) is not None]
+            for name in present:
+                _image(frame, name, look)[...] = getattr(exposure, name)
+            connection.send((exposure.stamp_s, present))
+
+
+def _image(frame: np.ndarray, name: str, look: Look) -> np.ndarray:
+    """Return the image `name` (H, W) or (H, W, 3) inside the shared frame."""
+    shape = (look.height, look.width) if name == "depth" else (look.height, look.width, 3)
+    return frame[name][: int(np.prod(shape))].reshape(shape)

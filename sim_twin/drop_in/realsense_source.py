@@ -1,0 +1,192 @@
+"""The optics of the twin's D405 for librealsense: depth rectified, colour as the raw left imager has it."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from typing import Self
+
+import cv2
+import mujoco
+import numpy as np
+
+from hal.base.clock import Clock, WallClock
+from hal.base.d405 import BASELINE_M, DEPTH_UNIT_M, MIN_Z_M, Calibration, Exposure, Look
+from hal.base.messages import Intrinsics
+from sim_twin.backends import give_way
+from sim_twin.camera import d405
+from sim_twin.camera.render import make_renderer
+from sim_twin.camera.wrist_view import View, WristRenderer, camera_id
+from sim_twin.clock import TwinClock
+from sim_twin.model.scene_view import SceneView
+from sim_twin.model.world import World
+
+
+class TwinSource:
+    """`hal.base.d405.FrameSource` of a world: `hal.compat.realsense.plug(TwinSource(world))`.
+
+    Drawing happens in a thread of its own, as an OpenGL context belongs to one thread.
+
+    Args:
+        world: what it looks at.
+        clock: a `TwinClock` of that world for lock-step (the default for a `World`), any other for free run.
+        renderer: one of `sim_twin.camera.gl.RENDERERS`; by default what the environment says.
+        calibration: of the unit; by default figures of real ones.
+        gives_way: whether it draws at low priority in free run, as in the process of a servo it must.
+    """
+
+    def __init__(
+        self,
+        world: SceneView,
+        clock: Clock | None = None,
+        renderer: str | None = None,
+        calibration: Calibration | None = None,
+        *,
+        gives_way: bool = True,
+    ) -> None:
+        self.world = world
+        if clock is None:
+            clock = TwinClock(world) if isinstance(world, World) else WallClock()
+        self.clock: Clock = clock
+        self.lockstep = isinstance(self.clock, TwinClock)
+        self.calibration = calibration if calibration is not None else Calibration()
+        self.attached = True
+        """Set it to False to pull the cable."""
+        self._kind = renderer
+        self._gives_way = gives_way and not self.lockstep
+        self._snapshot = mujoco.MjData(world.model)
+        self._optics: Optics | None = None
+        self._renderer: WristRenderer | None = None
+        self._thread: ThreadPoolExecutor | None = None
+
+    def expose(self, look: Look) -> Exposure:
+        """Return what the imagers see now.
+
+        Raises:
+            CameraError: the renderer asked for cannot be had.
+        """
+        if self._thread is None:
+            initializer = give_way if self._gives_way else None
+            self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="twin-d405", initializer=initializer)
+        return self._thread.submit(self._expose, look).result()
+
+    def warm_up(self, width: int = 848, height: int = 480) -> None:
+        """Open the renderer and draw once, so that the first frame is as quick as the others."""
+        self.expose(Look(number=0, width=width, height=height, depth=True, colour=True))
+
+    def reset(self) -> None:
+        """Nothing hangs in here."""
+
+    def close(self) -> None:
+        """Free the renderer and its thread until the next `expose`."""
+        thread, self._thread = self._thread, None
+        if thread is not None:
+            thread.submit(self._close_renderer).result()
+            thread.shutdown()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _expose(self, look: Look) -> Exposure:
+        stamp_s = self.clock.now_s()
+        data = self.world.snapshot(self._snapshot)
+        optics, renderer = self._prepare(look)
+        view = renderer.render(data)
+        colour = optics.distort(view.colour) if look.colour else None
+        left = view.colour[optics.window] if look.left else None
+        right = self._draw_right(renderer, data).colour[optics.window] if look.right else None
+        return Exposure(
+            number=look.number,
+            stamp_s=stamp_s,
+            depth=self._measure_depth(view.z_m[optics.window], optics.depth, look) if look.depth else None,
+            colour=self._measure_picture(colour, look, 0),
+            left=self._measure_picture(left, look, 1),
+            right=self._measure_picture(right, look, 2),
+        )
+
+    def _prepare(self, look: Look) -> tuple[Optics, WristRenderer]:
+        optics, renderer = self._optics, self._renderer
+        if optics is None or renderer is None or (optics.depth.width, optics.depth.height) != (look.width, look.height):
+            self._close_renderer()
+            optics = self._optics = Optics(self.calibration, look.width, look.height)
+            renderer = self._renderer = make_renderer(
+                self.world.model, optics.wide, self._kind, self.world.config.board, mask=False
+            )
+        return optics, renderer
+
+    def _close_renderer(self) -> None:
+        if self._renderer is not None:
+            self._renderer.close()
+        self._renderer = None
+
+    def _draw_right(self, renderer: WristRenderer, data: mujoco.MjData) -> View:
+        number = camera_id(self.world.model)
+        x_axis = data.cam_xmat[number].reshape(3, 3)[:, 0]
+        data.cam_xpos[number] += BASELINE_M * x_axis
+        return renderer.render(data)
+
+    def _measure_depth(self, z_m: np.ndarray, pinhole: Intrinsics, look: Look) -> np.ndarray:
+        """Return the depth (H, W) in units."""
+        config, min_z_m = self.world.config, MIN_Z_M[look.width, look.height]
+        if config.noise:
+            z_m = d405.measure_depth(np.ascontiguousarray(z_m), config.seed, look.number, pinhole, min_z_m)
+        else:
+            z_m = d405.round_depth(np.ascontiguousarray(z_m), min_z_m)
+        return np.rint(z_m / DEPTH_UNIT_M).astype(np.uint16)
+
+    def _measure_picture(self, picture: np.ndarray | None, look: Look, imager: int) -> np.ndarray | None:
+        if picture is None:
+            return None
+        if look.brightness != 1.0:
+            picture = cv2.convertScaleAbs(picture, alpha=look.brightness)
+        if not self.world.config.noise:
+            return picture
+        return d405.measure_colour(np.ascontiguousarray(picture), self.world.config.seed, 3 * look.number + imager)
+
+
+class Optics:
+    """Where each stream's pixels lie in one wide pinhole picture, which covers all that any of them sees.
+
+    The wide picture has the depth stream's focal length and pixel grid, so depth and infrared are a window of it and
+    only colour is resampled.
+
+    Args:
+        calibration: of the unit.
+        width: of the streams [px].
+        height: of the streams [px].
+    """
+
+    def __init__(self, calibration: Calibration, width: int, height: int) -> None:
+        pinhole = self.depth = calibration.depth(width, height)
+        u, v = _colour_in_depth(calibration, width, height)
+        left, top = (int(np.floor(min(a.min(), 0.0))) - 1 for a in (u, v))
+        right, bottom = (int(np.ceil(max(a.max(), n))) + 1 for a, n in ((u, width), (v, height)))
+        self.wide = Intrinsics(
+            width=right - left,
+            height=bottom - top,
+            fx=pinhole.fx,
+            fy=pinhole.fy,
+            cx=pinhole.cx - left,
+            cy=pinhole.cy - top,
+        )
+        self.window = (slice(-top, height - top), slice(-left, width - left))
+        self._maps = (u - left).astype(np.float32), (v - top).astype(np.float32)
+
+    def distort(self, wide: np.ndarray) -> np.ndarray:
+        """Return the unrectified colour image (height, width, 3) of a wide picture."""
+        return cv2.remap(wide, *self._maps, cv2.INTER_LINEAR)
+
+
+def _colour_in_depth(calibration: Calibration, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return for every colour pixel (height, width) where the depth stream's pinhole sees its ray [px]."""
+    colour, depth = calibration.colour(width, height), calibration.depth(width, height)
+    pixels = np.stack(np.meshgrid(np.arange(width, dtype=float), np.arange(height, dtype=float)), axis=-1)
+    until = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-9)
+    rays = cv2.undistortPointsIter(
+        pixels.reshape(-1, 1, 2), colour.K, np.array(calibration.colour_coeffs), np.eye(3), np.eye(3), until
+    )
+    rays = cv2.convertPointsToHomogeneous(rays).reshape(-1, 3) @ calibration.R_colour_depth  # into depth axes
+    points = (rays[:, :2] / rays[:, 2:]) * [depth.fx, depth.fy] + [depth.cx, depth.cy]
+    return points[:, 0].reshape(height, width), points[:, 1].reshape(height, width)

@@ -1,0 +1,118 @@
+"""What only the twin knows, over Zenoh and for evaluation alone: where everything really is."""
+
+from __future__ import annotations
+
+import atexit
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Self
+
+import msgpack
+import numpy as np
+
+from hal.base.clock import WallClock
+from hal.base.errors import HalTimeoutError
+from hal.bus.link import Link
+from hal.bus.service import Service
+from hal.bus.session import BusConfig, open_session
+
+if TYPE_CHECKING:
+    from sim_twin.model.scene_view import SceneView
+
+_TRUTH = "eval/truth"
+_POSES = ("T_base_object", "T_flange_camera", "T_base_board")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Truth:
+    """The scene as it really is."""
+
+    object: str
+    """Its name."""
+    T_base_object: np.ndarray
+    """(4, 4) its pose."""
+    lifted_m: float
+    """How much higher its lowest point is than at the start [m]."""
+    T_flange_camera: np.ndarray
+    """(4, 4) where the camera really is."""
+    T_base_board: np.ndarray | None
+    """(4, 4) where the calibration board is (`sim_twin.model.charuco_board.BoardSpec`); None without one."""
+    qpos: np.ndarray
+    """(14,) MuJoCo's positions: joints [rad], then the object's position [m] and quaternion (wxyz)."""
+
+
+def read_truth(world: SceneView) -> Truth:
+    """Return the truth about `world` at this moment."""
+    return Truth(
+        object=world.config.object,
+        T_base_object=world.T_base_object(),
+        lifted_m=world.lifted_m(),
+        T_flange_camera=world.config.T_flange_camera(),
+        T_base_board=None if world.config.board is None else world.config.board.T_base_board(),
+        qpos=world.poses()[1],
+    )
+
+
+class TruthServer:
+    """Answers questions about a world, beside its HAL process, whose link must be open.
+
+    Pictures are left to the asker: drawing one here would take the interpreter from the servo.
+    """
+
+    def __init__(self, config: BusConfig, world: SceneView) -> None:
+        self._world = world
+        self._session = open_session(config, listen=False)
+        self._service = Service(self._session, _TRUTH, self._answer, on_death=lambda: None)
+        atexit.register(self.close)  # a program that ends carelessly leaves no thread inside Zenoh
+
+    def close(self) -> None:
+        """Answer no more."""
+        atexit.unregister(self.close)
+        self._service.close()
+        self._session.close()
+
+    def _answer(self, asker: str, payload: bytes) -> bytes:
+        truth = read_truth(self._world)
+        content = {
+            "object": truth.object,
+            "lifted_m": truth.lifted_m,
+            "qpos": truth.qpos.tolist(),
+            **{name: None if (pose := getattr(truth, name)) is None else pose.ravel().tolist() for name in _POSES},
+        }
+        return msgpack.packb(content)  # pyright: ignore[reportReturnType] (its stub is wrong)
+
+
+class TruthClient:
+    """Asks a twin's HAL process.
+
+    Raises:
+        HalTimeoutError: no HAL process answers.
+    """
+
+    def __init__(self, config: BusConfig) -> None:
+        self._link = Link(replace(config, request_timeout_s=2.0), WallClock(), "the twin's truth")
+
+    def truth(self) -> Truth:
+        """Return the truth at this moment.
+
+        Raises:
+            HalTimeoutError: no twin answers, for instance because the HAL drives a real arm.
+        """
+        try:
+            content = msgpack.unpackb(self._link.ask(_TRUTH))
+        except HalTimeoutError as error:
+            raise HalTimeoutError(
+                f"the twin does not answer; only a simulated HAL knows the truth ({error})"
+            ) from error
+        for name in _POSES:
+            content[name] = None if content[name] is None else np.array(content[name]).reshape(4, 4)
+        return Truth(qpos=np.array(content.pop("qpos")), **content)
+
+    def close(self) -> None:
+        """Hang up."""
+        self._link.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()

@@ -1,0 +1,128 @@
+"""The simulated world: one arm, one table, one object, moved forward one control period at a time."""
+
+from __future__ import annotations
+
+import threading
+
+import mujoco
+import numpy as np
+
+from hal.base import z1
+from sim_twin.model.fixture import Fixture
+from sim_twin.model.scene import PHYSICS_PERIOD_S, SceneConfig, build_model
+from sim_twin.model.scene_view import SceneView
+
+GRIPPER_START_RAD = -1.0
+KP_MOTOR_MAX, KD_MOTOR_MAX = 1e4, 1e3
+"""What a motor's gains are cut to [Nm/rad], [Nm s/rad]: thirteen times the vendor's highest, and more."""
+_CTRL_MAX = 1e9
+"""MuJoCo takes 1e10 for a mistake; the effort limit is met long before."""
+_SUBSTEPS = round(z1.CONTROL_PERIOD_S / PHYSICS_PERIOD_S)
+_SETTLE_STEPS = 100
+
+
+class World(SceneView):
+    """Physics behind a lock: one thread steps it, others may take snapshots.
+
+    The arm starts at home with the jaws open by 1 rad; the object has settled.
+
+    Args:
+        config: what stands where.
+        q_start: (7,) where the arm starts instead [rad].
+    """
+
+    def __init__(self, config: SceneConfig, q_start: np.ndarray | None = None) -> None:
+        super().__init__(config)
+        self._model = build_model(config)
+        self.data = mujoco.MjData(self.model)
+        self._lock = threading.RLock()
+        self._steps = 0
+        self._fixture = Fixture(self.model) if config.is_held else None
+        self._gravcomp = self.model.body_gravcomp.copy()
+        start = np.append(z1.Q_HOME, GRIPPER_START_RAD) if q_start is None else q_start
+        self.data.qpos[: z1.N_JOINTS] = start
+        self.set_command(start, np.zeros(z1.N_JOINTS))
+        for _ in range(_SETTLE_STEPS):
+            self.step()
+        self._steps, self.data.time = 0, 0.0
+        mujoco.mj_forward(self.model, self.data)
+        self.start_height_m = self.lowest_m()
+
+    @property
+    def model(self) -> mujoco.MjModel:
+        """What MuJoCo computes with."""
+        return self._model
+
+    @property
+    def time_s(self) -> float:
+        """Simulated time [s]: whole control periods, free of rounding that adds up."""
+        return self._steps * z1.CONTROL_PERIOD_S
+
+    def step(self) -> None:
+        """Advance by one control period (2 ms)."""
+        with self._lock:
+            mujoco.mj_step(self.model, self.data, nstep=_SUBSTEPS)
+            self._steps += 1
+            if self._fixture is not None and self._fixture.update(self.model, self.data):
+                self._fixture = None
+
+    def advance_to(self, t_s: float) -> None:
+        """Step until `time_s >= t_s` [s]."""
+        while self.time_s < t_s - 1e-9:
+            self.step()
+
+    def set_command(self, q: np.ndarray, dq: np.ndarray) -> None:
+        """Set where the servos pull to: positions (7,) [rad] and velocities (7,) [rad/s]."""
+        with self._lock:
+            self._set_servos(z1.KP, z1.KD, self._gravcomp)
+            self.data.ctrl[:] = z1.KP * q + z1.KD * dq
+
+    def set_motors(
+        self,
+        q: np.ndarray,
+        dq: np.ndarray,
+        tau: np.ndarray,
+        kp: np.ndarray,
+        kd: np.ndarray,
+        *,
+        tau_max: np.ndarray = z1.TAU_MAX,
+    ) -> None:
+        """Let each motor make tau + kp · (q − q_measured) + kd · (dq − dq_measured), up to its effort limit; nothing
+        carries the arm besides.
+
+        Args:
+            q: (7,) [rad].
+            dq: (7,) [rad/s].
+            tau: (7,) [Nm].
+            kp: (7,) [Nm/rad]; from 0 to `KP_MOTOR_MAX`, beyond which physics would not be stable.
+            kd: (7,) [Nm s/rad]; from 0 to `KD_MOTOR_MAX`.
+            tau_max: (7,) the effort limits [Nm].
+        """
+        kp, kd = np.clip(kp, 0.0, KP_MOTOR_MAX), np.clip(kd, 0.0, KD_MOTOR_MAX)
+        with self._lock:
+            self._set_servos(kp, kd, 0.0, tau_max)
+            self.data.ctrl[:] = np.clip(tau + kp * q + kd * dq, -_CTRL_MAX, _CTRL_MAX)
+
+    def _set_servos(
+        self, kp: np.ndarray, kd: np.ndarray, gravcomp: np.ndarray | float, tau_max: np.ndarray = z1.TAU_MAX
+    ) -> None:
+        self.model.jnt_actfrcrange[: z1.N_JOINTS] = np.stack([-tau_max, tau_max], axis=1)
+        self.model.actuator_biasprm[:, 1] = -kp
+        self.model.actuator_biasprm[:, 2] = -kd
+        self.model.body_gravcomp[:] = gravcomp
+
+    def read_arm(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return positions [rad], velocities [rad/s] and motor torques [Nm], each (7,)."""
+        with self._lock:
+            n = z1.N_JOINTS
+            return self.data.qpos[:n].copy(), self.data.qvel[:n].copy(), self.data.qfrc_actuator[:n].copy()
+
+    def poses(self) -> tuple[float, np.ndarray]:
+        """Return MuJoCo's time [s] and positions (14 + 7 N,), as `SceneView.poses` says."""
+        with self._lock:
+            return float(self.data.time), self.data.qpos.copy()
+
+    @property
+    def fixture_holds(self) -> bool:
+        """True while the break-away fixture of a leaning object has not let go."""
+        return self._fixture is not None

@@ -1,0 +1,138 @@
+"""What the servo lets through to the arm."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hal.base.errors import InvalidMessageError
+from hal.base.z1 import CONTROL_PERIOD_S, DQ_MAX, KP, N_ARM, N_JOINTS, Q_MAX, Q_MIN
+from hal.servo.limits import ClippedSetpoint, OverloadWatch, ServoLimits, clip_setpoint, find_blocked, servo_torque
+
+LIMITS = ServoLimits()
+MIDDLE = (Q_MIN + Q_MAX) / 2
+ZERO = np.zeros(N_JOINTS)
+
+
+def clip(
+    q: np.ndarray, dq: np.ndarray, q_last: np.ndarray, q_measured: np.ndarray, dq_measured: np.ndarray = ZERO
+) -> ClippedSetpoint:
+    return clip_setpoint(LIMITS, q, dq, q_last=q_last, q_measured=q_measured, dq_measured=dq_measured)
+
+
+def test_a_harmless_setpoint_is_let_through_as_it_is() -> None:
+    q = MIDDLE + 0.001
+    allowed = clip(q, ZERO + 0.5, MIDDLE, MIDDLE)
+    assert (allowed.q == q).all()
+    assert (allowed.dq == 0.5).all()
+    assert not allowed.clipped
+
+
+def test_a_step_is_no_faster_than_the_joints() -> None:
+    allowed = clip(MIDDLE + 0.5, ZERO + 9.0, MIDDLE, MIDDLE)
+    assert allowed.q == pytest.approx(MIDDLE + DQ_MAX * CONTROL_PERIOD_S)
+    assert allowed.dq[:N_ARM] == pytest.approx(DQ_MAX[:N_ARM])
+    assert allowed.clipped
+
+
+@pytest.mark.parametrize(("edge", "side"), [(Q_MIN, -1.0), (Q_MAX, 1.0)])
+def test_positions_end_at_the_joint_limits(edge: np.ndarray, side: float) -> None:
+    allowed = clip(edge + side, ZERO, edge - side * 0.001, edge)
+    assert allowed.q == pytest.approx(edge)
+
+
+def test_what_is_clipped_at_a_joint_limit_is_not_told_to_move_on() -> None:
+    wish = MIDDLE.copy()
+    wish[4] = Q_MAX[4] + 0.001
+    allowed = clip(wish, ZERO + 1.0, wish, wish)
+    assert allowed.dq.tolist() == [1, 1, 1, 1, 0, 1, 1]
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_the_gripper_leads_its_measurement_by_the_grip_torque_at_most(side: float) -> None:
+    wish = MIDDLE.copy()
+    wish[N_ARM] += side * 0.5
+    last = MIDDLE.copy()
+    last[N_ARM] += side * 0.022
+    allowed = clip(wish, ZERO + 1.0, last, MIDDLE)
+    assert KP[N_ARM] * (allowed.q - MIDDLE)[N_ARM] == pytest.approx(side * 3.0)
+    assert allowed.dq[N_ARM] == 0.0
+    assert not allowed.clipped
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_a_jaw_that_moves_is_led_by_what_it_goes_until_it_is_heard_of(side: float) -> None:
+    wish, moving = MIDDLE.copy(), ZERO.copy()
+    wish[N_ARM] += side * 0.06
+    moving[N_ARM] = side * 2.0
+    ahead = clip(wish, moving, wish, MIDDLE, moving)
+    assert ahead.q[N_ARM] == wish[N_ARM]
+    assert ahead.dq[N_ARM] == side * 2.0
+    behind = clip(wish, moving, wish, MIDDLE, -moving)  # going the other way it is led by the torque alone
+    at_most = DQ_MAX[N_ARM] * CONTROL_PERIOD_S
+    assert side * (behind.q - MIDDLE)[N_ARM] == pytest.approx(max(3.0 / KP[N_ARM], 0.06 - at_most))
+
+
+def test_a_jaw_said_to_move_faster_than_it_can_is_led_no_further_for_it() -> None:
+    wish, moving = MIDDLE.copy(), ZERO.copy()
+    wish[N_ARM] += 0.5
+    moving[N_ARM] = 99.0
+    last = MIDDLE.copy()
+    last[N_ARM] += 0.5
+    lead = (clip(wish, ZERO, last, MIDDLE, moving).q - MIDDLE)[N_ARM]
+    most = 3.0 / KP[N_ARM] + DQ_MAX[N_ARM] * LIMITS.gripper_lag_s
+    assert lead == pytest.approx(max(most, 0.5 - DQ_MAX[N_ARM] * CONTROL_PERIOD_S))
+
+
+def test_an_arm_outside_its_limits_is_led_back_at_no_more_than_the_joints_speed() -> None:
+    outside = Q_MAX + 0.1
+    allowed = clip(outside, ZERO, outside, outside)
+    assert allowed.q[:N_ARM] == pytest.approx((outside - DQ_MAX * CONTROL_PERIOD_S)[:N_ARM])
+
+
+def test_a_joint_that_does_not_follow_is_named() -> None:
+    command = MIDDLE.copy()
+    command[3] += 0.31
+    assert find_blocked(LIMITS, command, MIDDLE).startswith("joint4 is 0.31 rad from its command")
+    command[3] = MIDDLE[3] + 0.29
+    command[N_ARM] += 1.0
+    assert find_blocked(LIMITS, command, MIDDLE) == ""
+
+
+def test_a_motor_may_be_at_its_limit_for_a_tenth_of_a_second() -> None:
+    watch = OverloadWatch(LIMITS)
+    tau = ZERO.copy()
+    tau[2] = -30.0
+    assert [watch.update(tau, ZERO) for _ in range(50)] == [""] * 50
+    assert watch.update(tau, ZERO).startswith("joint3 has been at its torque limit (-30.0 Nm of 29.4) for")
+
+
+def test_a_command_may_ask_for_more_than_a_motor_has_for_a_tenth_of_a_second() -> None:
+    watch = OverloadWatch(LIMITS)
+    command = MIDDLE.copy()
+    command[0] += 0.048
+    asked = servo_torque(command, MIDDLE)
+    assert asked[0] == pytest.approx(0.048 * 640)
+    assert [watch.update(ZERO, asked) for _ in range(50)] == [""] * 50
+    assert "joint1 does not follow: its command has asked for 30.7 Nm (allowed 30.0)" in watch.update(ZERO, asked)
+
+
+def test_a_gripper_may_be_asked_for_all_it_has() -> None:
+    watch = OverloadWatch(LIMITS)
+    asked = ZERO.copy()
+    asked[N_ARM] = 60.0
+    assert [watch.update(asked, asked) for _ in range(100)] == [""] * 100
+
+
+def test_short_peaks_of_different_motors_do_not_add_up() -> None:
+    watch = OverloadWatch(LIMITS)
+    for tick in range(300):
+        tau = ZERO.copy()
+        tau[tick // 40 % 2] = 60.0
+        assert watch.update(tau, ZERO) == ""
+
+
+@pytest.mark.parametrize("options", [{"grip_torque_nm": -1.0}, {"q_min": Q_MAX}, {"dq_max": [1, 2]}])
+def test_limits_that_make_no_sense_are_refused(options: dict) -> None:
+    with pytest.raises(InvalidMessageError):
+        ServoLimits(**options)

@@ -1,0 +1,64 @@
+"""A servo that only watches."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hal.backends.mock_arm import MockArm
+from hal.base.clock import ManualClock
+from hal.base.errors import CommandRejectedError, LeaseError
+from hal.base.messages import ArmSetpoint, ServoMode
+from hal.base.z1 import CONTROL_PERIOD_S
+from hal.servo.monitor_only import ReadonlyServo
+from tests.support.servo_bench import START, move, setpoint
+
+
+class HandledArm(MockArm):
+    """Is moved by somebody else, and takes no command."""
+
+    def send(self, wish: ArmSetpoint) -> ArmSetpoint:
+        raise AssertionError("commanded by who only watches")
+
+    def push(self, rad: float) -> None:
+        self._target = self._target + rad
+
+
+def test_it_tells_where_the_arm_is_and_sends_nothing() -> None:
+    clock = ManualClock(5.0)
+    arm = HandledArm(clock, q=START)
+    servo = ReadonlyServo(arm, clock)
+    servo.connect()
+    for _ in range(500):
+        arm.push(1e-3)
+        clock.advance(CONTROL_PERIOD_S)
+        servo.tick()
+    status = servo.status()
+    assert (status.mode, status.reason) == (ServoMode.HOLDING, "")
+    assert servo.read_state().q[0] > START[0] + 0.3
+    np.testing.assert_allclose(status.q_command, servo.read_state().q)
+    servo.disconnect()
+
+
+def test_it_refuses_whoever_wants_the_arm() -> None:
+    clock = ManualClock(5.0)
+    servo = ReadonlyServo(HandledArm(clock, q=START), clock)
+    servo.connect()
+    servo.tick()
+    with pytest.raises(LeaseError, match=r"'demo' cannot have the arm\. Start it again without --readonly"):
+        servo.claim("demo")
+    for command in (lambda: servo.stream(move(), owner="demo"), lambda: servo.send(setpoint(START), owner="demo")):
+        with pytest.raises(LeaseError):
+            command()
+    with pytest.raises(CommandRejectedError, match=r"cannot stop the arm \(the button\): stop whoever moves it"):
+        servo.stop("the button")
+
+
+def test_a_fault_of_the_arm_is_told() -> None:
+    clock = ManualClock(5.0)
+    arm = HandledArm(clock, q=START)
+    servo = ReadonlyServo(arm, clock)
+    servo.connect()
+    arm.inject_fault("overheat joint 2")
+    servo.tick()
+    assert "overheat joint 2" in servo.status().reason

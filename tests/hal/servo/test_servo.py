@@ -1,0 +1,539 @@
+"""The servo over a mock arm, with every fault it is there for."""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+import pytest
+
+from hal.base.arm import ServoedArm
+from hal.base.errors import CommandRejectedError, HalTimeoutError, LeaseError, StoppedError
+from hal.base.messages import ServoMode, TrajectoryChunk
+from hal.base.z1 import CONTROL_PERIOD_S, DDQ_MAX, DQ_MAX, KP, N_ARM, N_JOINTS, Q_MAX, Q_MIN, TAU_MAX
+from hal.servo.limits import ServoLimits
+from tests.support.servo_bench import ARM, RAMP_S, START, STEP, Bench, cruise, move, setpoint
+
+HOLDING, TRACKING, BRAKING, STOPPED = ServoMode.HOLDING, ServoMode.TRACKING, ServoMode.BRAKING, ServoMode.STOPPED
+
+
+def test_a_servo_satisfies_the_contract() -> None:
+    assert isinstance(Bench().servo, ServoedArm)
+
+
+def test_a_trajectory_is_played_to_its_end() -> None:
+    bench = Bench()
+    bench.servo.stream(move())
+    bench.run(1.1)
+    status = bench.servo.status()
+    assert (status.mode, status.finished, status.reason) == (HOLDING, True, "")
+    assert (status.trajectory_id, status.trajectory_time_s, status.buffered_s) == (1, pytest.approx(1.0), 0.0)
+    assert status.q_command[ARM] == pytest.approx((START + STEP)[ARM])
+    assert bench.arm.read_state().q[ARM] == pytest.approx((START + STEP)[ARM], abs=1e-3)
+
+
+def test_every_setpoint_lies_on_the_trajectory() -> None:
+    bench = Bench()
+    bench.servo.stream(move())
+    bench.run(1.0)
+    s = np.arange(500) * CONTROL_PERIOD_S
+    path = START + (10 * s**3 - 15 * s**4 + 6 * s**5)[:, None] * STEP
+    assert bench.commanded()[1:501, ARM] == pytest.approx(path[:, ARM], abs=1e-5)
+
+
+def test_chunks_are_joined_without_a_seam() -> None:
+    whole, pieces = Bench(), Bench()
+    whole.servo.stream(move())
+    whole.run(1.1)
+    pieces.servo.stream(move(until_s=0.3))
+    pieces.run(0.1)
+    pieces.servo.stream(move(from_s=0.3, until_s=0.6))
+    pieces.run(0.4)
+    pieces.servo.stream(move(from_s=0.6))
+    pieces.run(0.6)
+    assert pieces.servo.status().finished
+    assert pieces.commanded() == pytest.approx(whole.commanded(), abs=1e-9)
+
+
+def test_the_buffered_time_is_told() -> None:
+    bench = Bench()
+    bench.servo.stream(move(until_s=0.3))
+    assert bench.servo.status().buffered_s == pytest.approx(0.3)
+    bench.run(0.102)
+    assert bench.servo.status().buffered_s == pytest.approx(0.2)
+
+
+def test_a_late_tick_holds_the_trajectory_time_and_is_counted() -> None:
+    bench = Bench()
+    bench.servo.stream(move())
+    bench.run(0.5)
+    before = bench.servo.status()
+    bench.clock.advance(0.05)
+    bench.run(CONTROL_PERIOD_S)
+    after = bench.servo.status()
+    assert after.trajectory_time_s - before.trajectory_time_s == pytest.approx(CONTROL_PERIOD_S)
+    assert after.overruns - before.overruns == 1
+    bench.run(1.0)
+    assert bench.servo.status().finished
+    assert bench.servo.status().overruns == after.overruns
+
+
+# --- Losing the sender --------------------------------------------------------------------------------------------
+
+
+def test_a_starved_servo_brakes_and_holds() -> None:
+    bench = Bench()
+    bench.servo.stream(move(until_s=0.4))
+    bench.run(0.42)
+    assert bench.mode is BRAKING
+    bench.run_until_at_rest()
+    status = bench.servo.status()
+    assert status.mode is HOLDING
+    assert not status.finished
+    assert "ran dry at 0.400 s" in status.reason
+    held = status.q_command
+    bench.run(0.5)
+    assert bench.servo.status().q_command == pytest.approx(held, abs=1e-12)
+
+
+def test_a_dropped_trajectory_is_not_taken_up_again_but_a_new_one_is() -> None:
+    bench = Bench()
+    bench.servo.stream(move(until_s=0.4))
+    bench.run(1.0)
+    with pytest.raises(CommandRejectedError, match=r"trajectory 1 is over .*ran dry.*next one is 2"):
+        bench.servo.stream(move(from_s=0.4))
+    bench.servo.stream(move(2, start=bench.servo.status().q_command, step=-0.2 * STEP))
+    bench.run(1.2)
+    assert bench.servo.status().finished
+    assert bench.reason == ""
+
+
+def test_a_late_heartbeat_brakes() -> None:
+    bench = Bench(heartbeat_timeout_s=0.1)
+    bench.servo.stream(move())
+    bench.run(0.3, bench.servo.heartbeat)
+    assert bench.mode is TRACKING
+    bench.run(0.12)
+    assert bench.mode is BRAKING
+    assert "no heartbeat from 'test'" in bench.reason
+    bench.run_until_at_rest()
+    assert bench.mode is HOLDING
+    assert not bench.servo.status().finished
+
+
+def test_an_owner_in_this_process_needs_no_heartbeat() -> None:
+    bench = Bench()
+    bench.servo.stream(move())
+    bench.run(1.1)
+    assert bench.servo.status().finished
+
+
+def test_a_single_setpoint_is_followed_and_then_held() -> None:
+    bench = Bench()
+    goal = START + 0.1
+    bench.run(0.5, lambda: bench.servo.send(setpoint(goal)) and None)
+    assert bench.servo.status().q_command[ARM] == pytest.approx(goal[ARM])
+    assert bench.mode is TRACKING
+    bench.run(0.5)
+    assert bench.mode is HOLDING
+    assert bench.servo.status().q_command[ARM] == pytest.approx(goal[ARM], abs=1e-6)
+
+
+def test_a_sender_of_setpoints_that_falls_silent_in_motion_brakes_the_arm() -> None:
+    bench = Bench()
+    goal = START.copy()
+    goal[0] += 2.0
+    bench.servo.send(setpoint(goal))
+    bench.run(0.12)
+    assert bench.mode is BRAKING
+    bench.run_until_at_rest()
+    assert bench.servo.status().q_command[0] < goal[0] - 0.5
+
+
+# --- Stop ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_stop_brakes_at_the_next_tick_and_latches() -> None:
+    bench = Bench()
+    bench.servo.stream(move())
+    bench.run(0.5)
+    bench.servo.stop("the button")
+    with pytest.raises(StoppedError, match="the button"):
+        bench.servo.stream(move(2))
+    bench.run(CONTROL_PERIOD_S)
+    assert bench.mode is BRAKING
+    assert bench.run_until_at_rest() < 0.4
+    assert (bench.mode, bench.reason) == (STOPPED, "the button")
+    held = bench.servo.status().q_command
+    for command in (lambda: bench.servo.stream(move(2)), lambda: bench.servo.send(setpoint(START))):
+        with pytest.raises(StoppedError, match="the button"):
+            command()
+    bench.run(0.5)
+    assert bench.servo.status().q_command == pytest.approx(held, abs=1e-12)
+
+
+def test_rearming_lifts_the_stop_and_frees_the_lease() -> None:
+    bench = Bench()
+    bench.servo.stream(move())
+    bench.run(0.5)
+    bench.servo.stop()
+    bench.run(0.5)
+    bench.servo.rearm()
+    bench.run(0.1)
+    status = bench.servo.status()
+    assert (status.mode, status.owner, status.reason) == (HOLDING, "", "")
+    with pytest.raises(LeaseError):
+        bench.servo.stream(move(2))
+    bench.servo.claim("another")
+    bench.servo.stream(move(2, start=status.q_command, step=-0.2 * STEP))
+    bench.run(1.2)
+    assert bench.servo.status().finished
+
+
+def test_a_stop_clears_what_was_queued_even_when_it_is_lifted_before_the_next_tick() -> None:
+    bench = Bench()
+    bench.servo.stream(move())
+    bench.run(0.5)
+    bench.servo.stop()
+    bench.servo.rearm()
+    bench.run(CONTROL_PERIOD_S)
+    assert bench.mode is BRAKING
+    bench.run_until_at_rest()
+    assert bench.mode is HOLDING
+    assert not bench.servo.status().finished
+
+
+def test_a_stop_in_the_middle_of_a_tick_is_not_told_as_rest_before_the_arm_has_braked(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    bench = Bench()
+    bench.servo.stream(move())
+    bench.run(0.5)
+    send = bench.arm.send
+    monkeypatch.setattr(bench.arm, "send", lambda wish: (bench.servo.stop("the button"), send(wish))[1])
+    bench.run(CONTROL_PERIOD_S)
+    monkeypatch.undo()
+    assert (bench.mode, bench.reason) == (TRACKING, "the button")
+    bench.run_until_at_rest()
+    assert bench.mode is STOPPED
+
+
+def test_a_stop_while_a_single_setpoint_is_chased_brakes_and_latches() -> None:
+    bench = Bench()
+    goal = START.copy()
+    goal[0] += 2.0
+    bench.run(0.3, lambda: bench.servo.send(setpoint(goal)) and None)
+    bench.servo.stop("the button")
+    bench.run(CONTROL_PERIOD_S)
+    assert bench.mode is BRAKING
+    assert bench.run_until_at_rest() < 0.4
+    assert (bench.mode, bench.reason) == (STOPPED, "the button")
+    bench.servo.rearm()
+    held = bench.servo.status().q_command
+    bench.run(0.3)
+    assert bench.servo.status().q_command == pytest.approx(held, abs=1e-3)
+
+
+def test_a_stop_while_braking_goes_on_braking_and_latches() -> None:
+    bench = Bench()
+    bench.servo.stream(move(until_s=0.5))
+    bench.run(0.55)
+    assert bench.mode is BRAKING
+    bench.servo.stop("the button")
+    assert bench.run_until_at_rest() < 0.4
+    assert (bench.mode, bench.reason) == (STOPPED, "the button")
+
+
+def test_a_trajectory_stopped_before_its_first_tick_is_counted_so_that_the_next_one_is_taken() -> None:
+    bench = Bench()
+    bench.servo.stream(move())
+    bench.servo.stop()
+    bench.run(0.1)
+    assert bench.servo.status().trajectory_id == 1
+    assert bench.arm.read_state().q == pytest.approx(START, abs=1e-6)
+    bench.servo.rearm()
+    bench.servo.claim("test")
+    bench.servo.stream(move(bench.servo.status().trajectory_id + 1))
+    bench.run(1.1)
+    assert bench.servo.status().finished
+
+
+def test_a_stop_at_rest_moves_nothing() -> None:
+    bench = Bench()
+    bench.run(0.1)
+    bench.servo.stop()
+    bench.run(0.2)
+    assert bench.mode is STOPPED
+    assert bench.commanded() == pytest.approx(np.tile(START, (len(bench.sent), 1)), abs=1e-9)
+
+
+def test_releasing_the_lease_in_motion_brakes() -> None:
+    bench = Bench()
+    bench.servo.stream(move())
+    bench.run(0.5)
+    bench.servo.release()
+    bench.run(CONTROL_PERIOD_S)
+    assert bench.mode is BRAKING
+    assert "released" in bench.reason
+    bench.run_until_at_rest()
+    assert bench.servo.status().owner == ""
+
+
+# --- Braking ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("joint", range(N_ARM))
+def test_braking_from_full_speed_takes_less_than_0_4_s(joint: int) -> None:
+    bench = Bench()
+    bench.servo.stream(cruise(joint, [1, 1, -1, 1, 1, -1][joint] * 0.99 * DQ_MAX[joint], RAMP_S + 0.05))
+    bench.run(RAMP_S + 0.05 + 2 * CONTROL_PERIOD_S)
+    assert bench.mode is BRAKING
+    assert bench.run_until_at_rest(0.4) < 0.4
+    q = bench.commanded()
+    assert (q >= Q_MIN - 1e-9).all()
+    assert (q <= Q_MAX + 1e-9).all()
+
+
+def test_braking_stays_within_speed_acceleration_and_jerk() -> None:
+    bench = Bench()
+    bench.servo.stream(move(step=0.6 * STEP, until_s=0.5))
+    bench.run(0.498)
+    begin = len(bench.sent)
+    bench.run(0.5)
+    assert "ran dry" in bench.reason
+    q = bench.commanded()[begin - 3 :, ARM]
+    speed = np.diff(q, axis=0) / CONTROL_PERIOD_S
+    acceleration = np.diff(speed, axis=0) / CONTROL_PERIOD_S
+    jerk = np.diff(acceleration, axis=0) / CONTROL_PERIOD_S
+    assert (np.abs(speed) <= DQ_MAX[ARM]).all()
+    assert (np.abs(acceleration) <= DDQ_MAX[ARM] + 1e-6).all()
+    # Sampling a jerk-limited path at 2 ms cannot show more than its jerk; the trajectory before it was smooth.
+    assert (np.abs(jerk[3:]) <= bench.servo.limits.dddq_max[ARM] + 1e-3).all()
+
+
+# --- Replacement ----------------------------------------------------------------------------------------------------
+
+
+def test_a_trajectory_replaced_in_motion_goes_over_without_a_jump() -> None:
+    bench = Bench()
+    bench.servo.stream(move())
+    bench.run(0.5)
+    here = bench.servo.status().q_command
+    back = np.zeros(N_JOINTS)
+    back[0] = -0.3
+    bench.servo.stream(move(2, start=here, step=back))
+    begin = len(bench.sent)
+    bench.run(2.5)
+    q = bench.commanded()[begin - 3 :, ARM]
+    speed = np.diff(q, axis=0) / CONTROL_PERIOD_S
+    assert np.abs(speed).max() < 2.0
+    assert np.abs(np.diff(speed, axis=0)).max() < 0.05  # the command's speed has no step
+    status = bench.servo.status()
+    assert (status.trajectory_id, status.finished) == (2, True)
+    assert status.q_command[ARM] == pytest.approx((here + back)[ARM], abs=1e-6)
+
+
+def test_a_trajectory_replaces_a_single_setpoint_for_good() -> None:
+    bench = Bench()
+    goal = START.copy()
+    goal[0] += 0.04
+    bench.servo.send(setpoint(goal))
+    bench.run(0.01)
+    here = bench.servo.status().q_command
+    still = TrajectoryChunk(
+        trajectory_id=1, t_s=np.array([0.0, 0.04]), q=np.array([here, here]), dq=np.zeros((2, 7)), final=True
+    )
+    bench.servo.stream(still)
+    bench.run(0.5)
+    assert bench.servo.status().finished
+    assert bench.servo.status().q_command == pytest.approx(here, abs=1e-6)
+
+
+# --- Faults ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_fault_of_the_arm_brakes_and_latches() -> None:
+    bench = Bench()
+    bench.servo.stream(move())
+    bench.run(0.5)
+    bench.arm.inject_fault("overheat joint 2")
+    bench.run(CONTROL_PERIOD_S)
+    assert bench.mode is BRAKING
+    bench.run_until_at_rest()
+    assert (bench.mode, bench.reason) == (STOPPED, "the arm reports overheat joint 2")
+    bench.servo.rearm()
+    bench.run(0.01)
+    assert bench.mode is STOPPED, "the fault is still there"
+    bench.arm.inject_fault()
+    bench.servo.rearm()
+    bench.run(0.01)
+    assert bench.mode is HOLDING
+
+
+def test_a_blocked_joint_latches_and_the_arm_gives_way() -> None:
+    bench = Bench()
+    bench.servo.stream(move())
+    bench.run(0.2)
+    bench.arm.block(0)
+    bench.run(1.5)
+    status = bench.servo.status()
+    assert status.mode is STOPPED
+    assert "joint1 has been at its torque limit" in status.reason
+    assert status.q_command[0] == pytest.approx(bench.arm.read_state().q[0], abs=1e-3)
+
+
+def test_an_arm_that_is_blocked_while_it_brakes_for_a_stop_gives_way_too_and_only_once() -> None:
+    bench = Bench()
+    bench.servo.stream(move())
+    bench.run(0.5)
+    bench.servo.stop("the button")
+    bench.arm.block(0)
+    bench.run(1.5)
+    assert (bench.mode, bench.reason) == (STOPPED, "the button")
+    blocked_at = bench.arm.read_state().q
+    assert bench.servo.status().q_command[0] == pytest.approx(blocked_at[0], abs=1e-3)
+    bench.arm.block(None)
+    bench.arm.offset[0] = -0.06  # 38 Nm: pushed away, it does not follow for ever
+    bench.run(1.0)
+    assert bench.servo.status().q_command[0] == pytest.approx(blocked_at[0], abs=1e-3)
+
+
+def test_lost_commands_are_noticed_as_a_joint_that_does_not_follow() -> None:
+    bench = Bench()
+    bench.arm.drop_commands = True
+    bench.servo.stream(move())
+    bench.run(1.5)
+    assert bench.mode is STOPPED
+    assert "joint1 does not follow: its command has asked for" in bench.reason
+    asked = KP[0] * (bench.servo.status().q_command - bench.arm.read_state().q)[0]
+    assert abs(asked) < TAU_MAX[0], "at rest the command has given way"
+
+
+def test_a_joint_far_from_its_command_latches_at_once() -> None:
+    bench = Bench(limits=ServoLimits(tau_max=np.full(N_JOINTS, 1e4)))
+    bench.arm.drop_commands = True
+    bench.servo.stream(move())
+    bench.run(1.5)
+    assert bench.mode is STOPPED
+    assert "from its command (allowed 0.30)" in bench.reason
+
+
+def test_a_motor_at_its_torque_limit_for_long_latches() -> None:
+    bench = Bench()
+    bench.arm.offset[1] = 0.12  # less than a following error, but more than 60 Nm
+    bench.run(0.08)
+    assert bench.mode is HOLDING
+    bench.run(0.2)
+    assert bench.mode is STOPPED
+    assert "joint2 has been at its torque limit" in bench.reason
+
+
+def test_an_arm_that_falls_silent_is_braked_blind_and_latched() -> None:
+    bench = Bench()
+    bench.servo.stream(move())
+    bench.run(0.5)
+    bench.arm.freeze()
+    bench.run(0.11)
+    assert bench.mode is BRAKING
+    assert "state is lost" in bench.reason
+    bench.run_until_at_rest()
+    assert bench.mode is STOPPED
+    with pytest.raises(HalTimeoutError):
+        bench.servo.read_state()
+    bench.arm.thaw()
+    bench.servo.rearm()
+    bench.run(0.5)
+    assert bench.mode is HOLDING
+
+
+def test_an_arm_that_takes_no_commands_is_latched_and_left_alone() -> None:
+    bench = Bench()
+    bench.servo.stream(move())
+    bench.run(0.5)
+    bench.arm.refuse_commands = True
+    bench.run(1.0)
+    assert bench.mode is STOPPED
+    assert "takes no commands" in bench.reason
+    bench.arm.refuse_commands = False
+    stuck = bench.servo.status().q_command
+    bench.run(0.1)
+    assert bench.servo.status().q_command == pytest.approx(stuck)
+    bench.servo.rearm()
+    bench.run(0.5)
+    assert bench.mode is HOLDING
+    assert bench.reason == ""
+
+
+# --- Limits ---------------------------------------------------------------------------------------------------------
+
+
+def test_the_gripper_squeezes_with_a_bounded_torque_and_keeps_squeezing() -> None:
+    bench = Bench()
+    close = np.zeros(N_JOINTS)
+    close[N_ARM] = 0.5
+    bench.servo.stream(move(step=close))
+    bench.run(0.3)
+    bench.arm.block(N_ARM)
+    bench.run(1.0)
+    status = bench.servo.status()
+    assert (status.mode, status.finished) == (HOLDING, True)
+    tau = bench.arm.read_state().tau
+    assert tau[N_ARM] == pytest.approx(3.0, rel=1e-6)
+    bench.servo.stop()
+    bench.run(0.5)
+    assert bench.arm.read_state().tau[N_ARM] == pytest.approx(3.0, rel=1e-6)
+
+
+@pytest.mark.parametrize("grip", ["as wished", "as sent"])
+def test_a_motion_with_a_held_object_starts_from_the_gripper_command(grip: str) -> None:
+    bench = Bench()
+    close = np.zeros(N_JOINTS)
+    close[N_ARM] = 0.5
+    bench.servo.stream(move(step=close))
+    bench.run(0.3)
+    bench.arm.block(N_ARM)
+    bench.run(1.0)
+    start = bench.servo.status().q_command.copy()
+    start[N_ARM] = 0.0 if grip == "as wished" else start[N_ARM]
+    lift = 0.3 * STEP
+    lift[N_ARM] = 0.0
+    bench.servo.stream(move(2, start=start, step=lift))
+    bench.run(1.2)
+    assert bench.servo.status().finished
+    assert KP[N_ARM] * (bench.servo.status().q_command - bench.arm.read_state().q)[N_ARM] > 2.9
+
+
+def test_a_latched_stop_and_its_end_are_told_once_each(caplog: pytest.LogCaptureFixture) -> None:
+    bench = Bench()
+    with caplog.at_level(logging.INFO, logger="hal"):
+        bench.arm.inject_fault("overheat joint 2")
+        bench.run(0.1)
+        bench.arm.inject_fault()
+        bench.servo.rearm()
+        bench.run(0.1)
+    first, second = [record.getMessage() for record in caplog.records]
+    assert first == "servo: stopped: the arm reports overheat joint 2"
+    assert second == "servo: re-armed"
+
+
+def test_clipping_is_told_once_a_second(caplog: pytest.LogCaptureFixture) -> None:
+    bench = Bench()
+    beyond = START.copy()
+    beyond[4] = Q_MAX[4] + 0.5
+    with caplog.at_level(logging.WARNING, logger="hal"):
+        bench.run(2.5, lambda: bench.servo.send(setpoint(beyond)) and None)
+    assert 2 <= len(caplog.records) <= 3
+    assert "clipped" in caplog.text
+
+
+def test_an_arm_that_is_ticked_is_asked_by_the_tick_alone() -> None:
+    bench = Bench()
+    bench.run(0.1)
+    reads: list[float] = []
+    bench.arm.read_state = lambda: reads.append(1.0)  # type: ignore[method-assign, assignment]
+    bench.clock.advance(0.1)
+    assert bench.servo.read_state().q == pytest.approx(START)
+    bench.clock.advance(0.2)
+    with pytest.raises(HalTimeoutError, match=r"0\.30 s old; allowed is 0\.2 s"):
+        bench.servo.read_state()
+    assert reads == []

@@ -1,0 +1,94 @@
+"""The thread that ticks the servo on the wall clock."""
+
+from __future__ import annotations
+
+import threading
+
+import numpy as np
+import pytest
+
+from hal.backends.mock_arm import MockArm
+from hal.base.clock import ManualClock, WallClock
+from hal.base.messages import ServoMode
+from hal.base.z1 import CONTROL_PERIOD_S, N_ARM
+from hal.servo.servo import Servo
+from hal.servo.servo_thread import ServoThread
+from tests.support.servo_bench import START, STEP, move
+
+
+class CountingServo:
+    """Stands in for a servo: notes when it is ticked, and ends or breaks the loop after some ticks."""
+
+    def __init__(self, clock: ManualClock, stall_at: int = -1) -> None:
+        self.clock = clock
+        self.stall_at = stall_at
+        self.woke_s: list[float] = []
+        self.enough = threading.Event()
+        self.periods = Servo(MockArm(clock), clock).periods
+
+    def tick(self) -> None:
+        self.woke_s.append(self.clock.now_s())
+        if len(self.woke_s) == self.stall_at:
+            self.clock.advance(0.0305)
+        if len(self.woke_s) == 60:
+            self.enough.set()
+        if len(self.woke_s) >= 60:
+            threading.Event().wait(0.001)  # leave the interpreter to the test
+
+
+def ticks_of(stall_at: int = -1) -> np.ndarray:
+    servo = CountingServo(ManualClock(), stall_at)
+    with ServoThread(servo, servo.clock):  # type: ignore[arg-type]
+        assert servo.enough.wait(20.0)
+    return np.array(servo.woke_s[:60])
+
+
+def test_it_ticks_on_absolute_deadlines() -> None:
+    assert ticks_of() == pytest.approx(np.arange(60) * CONTROL_PERIOD_S)
+
+
+def test_after_a_stall_it_neither_skips_nor_bursts() -> None:
+    periods = np.diff(ticks_of(stall_at=20))
+    assert periods[19] == pytest.approx(0.0305)
+    assert np.delete(periods, 19) == pytest.approx(np.full(58, CONTROL_PERIOD_S))
+
+
+def test_a_servo_on_the_wall_clock_plays_a_trajectory_and_measures_its_periods() -> None:
+    clock = WallClock()
+    arm = MockArm(clock, q=START)
+    servo = Servo(arm, clock)
+    servo.connect()
+    servo.claim("test")
+    thread = ServoThread(servo, clock)
+    thread.start()
+    thread.start()
+    servo.stream(move(duration_s=1.0))
+    while not (servo.status().finished or servo.status().reason):
+        clock.sleep_until(clock.now_s() + 0.02)
+    assert thread.alive
+    thread.stop()
+    thread.stop()
+    status = servo.status()
+    assert status.finished
+    assert status.q_command[:N_ARM] == pytest.approx((START + STEP)[:N_ARM])
+    assert status.ticks >= 501
+    assert 0 < status.period_ms_p50 <= status.period_ms_p999
+
+
+def test_what_a_tick_raises_latches_a_stop_and_comes_out_when_the_thread_is_ended(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    clock = WallClock()
+    arm = MockArm(clock, q=START)
+    servo = Servo(arm, clock)
+    servo.connect()
+    thread = ServoThread(servo, clock)
+    thread.start()
+    monkeypatch.setattr(arm, "read_state", lambda: 1 / 0)
+    while thread.alive:
+        clock.sleep_until(clock.now_s() + 0.005)
+    status = servo.status()
+    assert status.mode is ServoMode.STOPPED
+    assert "the servo's tick failed" in status.reason
+    with pytest.raises(ZeroDivisionError):
+        thread.stop()

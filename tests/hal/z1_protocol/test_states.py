@@ -1,0 +1,44 @@
+"""The vendor's state machine, as it was observed."""
+
+from __future__ import annotations
+
+import pytest
+
+from hal.z1_protocol.states import MOVES, Fsm, granted
+
+
+@pytest.mark.parametrize(
+    ("now", "asked", "expected"),
+    [
+        (Fsm.PASSIVE, Fsm.JOINTCTRL, True),
+        (Fsm.PASSIVE, Fsm.CARTESIAN, True),
+        (Fsm.PASSIVE, Fsm.BACKTOSTART, True),
+        (Fsm.PASSIVE, Fsm.LOWCMD, True),
+        (Fsm.PASSIVE, Fsm.MOVEJ, False),
+        (Fsm.JOINTCTRL, Fsm.LOWCMD, False),
+        (Fsm.CARTESIAN, Fsm.LOWCMD, False),
+        (Fsm.LOWCMD, Fsm.JOINTCTRL, True),
+        (Fsm.LOWCMD, Fsm.PASSIVE, True),
+        (Fsm.LOWCMD, Fsm.MOVEJ, False),
+        (Fsm.JOINTCTRL, Fsm.MOVEJ, True),
+        (Fsm.JOINTCTRL, Fsm.TOSTATE, True),
+        (Fsm.CARTESIAN, Fsm.BACKTOSTART, True),
+        (Fsm.MOVEJ, Fsm.JOINTCTRL, True),
+        (Fsm.MOVEJ, Fsm.MOVEL, False),
+        (Fsm.TEACH, Fsm.JOINTCTRL, True),
+    ],
+)
+def test_a_request_is_granted_as_the_controller_grants_it(now: Fsm, asked: Fsm, expected: bool) -> None:
+    assert granted(now, asked) is expected
+
+
+@pytest.mark.parametrize("state", list(Fsm))
+def test_staying_is_always_granted(state: Fsm) -> None:
+    assert granted(state, state)
+    assert granted(state, Fsm.INVALID)
+
+
+@pytest.mark.parametrize("state", sorted(MOVES))
+def test_no_move_starts_from_lowcmd_or_during_another(state: Fsm) -> None:
+    assert not granted(Fsm.LOWCMD, state)
+    assert not granted(Fsm.TRAJECTORY if state is not Fsm.TRAJECTORY else Fsm.MOVEL, state)

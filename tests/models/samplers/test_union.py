@@ -1,0 +1,125 @@
+"""A union of generators: all asked, all scored alike, near copies thinned."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from models.diffusion.sampler import DiffusionSampler
+from models.diffusion.training.labels import GRIPPERS, check_grasps
+from models.diffusion.training.shapes import make_shape
+from models.diffusion.training.views import ViewConfig, render_view
+from models.factory import make_generator
+from models.samplers.antipodal import AntipodalSampler
+from models.samplers.obb_sweep import ObbSweepSampler
+from models.samplers.union import UnionSampler, find_copies
+from models.types import GraspSet
+
+CLOUD = np.random.default_rng(0).uniform([-0.03, -0.05, 0.38], [0.03, 0.05, 0.42], (200, 3))
+
+
+class At:
+    """Proposes `n` grasps in a row from `start` along x."""
+
+    def __init__(self, start_m: float, step_m: float = 0.01, name: str = "at") -> None:
+        self.start_m, self.step_m, self.name = start_m, step_m, name
+
+    def sample(self, points: np.ndarray, n: int, seed: int) -> GraspSet:
+        T = np.tile(np.eye(4), (n, 1, 1))
+        T[:, 0, 3] = self.start_m + self.step_m * np.arange(n)
+        return GraspSet(T_camera_grasps=T, scores=np.ones(n), widths_m=np.full(n, 0.05), source=self.name)
+
+
+class Refuses:
+    def sample(self, points: np.ndarray, n: int, seed: int) -> GraspSet:
+        raise ValueError("nothing to hold here")
+
+
+class LikesRight:
+    """Scores by x alone, and counts what it was shown."""
+
+    def __init__(self) -> None:
+        self.shown = 0
+
+    def score(self, points: np.ndarray, grasps: GraspSet, seed: int) -> np.ndarray:
+        self.shown = len(grasps)
+        return 1.0 / (1.0 + np.exp(-grasps.T_camera_grasps[:, 0, 3]))
+
+
+def test_every_member_is_asked_for_all_and_the_best_by_one_judge_are_kept():
+    judge = LikesRight()
+    grasps = UnionSampler([At(0.0, name="a"), At(0.055, name="b")], judge).sample(CLOUD, 10, 0)
+    assert judge.shown == 20
+    assert len(grasps) == 10
+    expected = np.sort(np.concatenate([0.01 * np.arange(10), 0.055 + 0.01 * np.arange(10)]))[::-1][:10]
+    np.testing.assert_allclose(grasps.T_camera_grasps[:, 0, 3], expected)
+    assert (np.diff(grasps.scores) <= 0.0).all()
+    assert grasps.source == "union:a+b"
+
+
+def test_of_near_copies_only_the_best_counts_as_long_as_there_are_others():
+    twins = UnionSampler([At(0.0), At(0.001)], LikesRight())
+    grasps = twins.sample(CLOUD, 10, 0)
+    np.testing.assert_allclose(grasps.T_camera_grasps[:, 0, 3], 0.001 + 0.01 * np.arange(10)[::-1])
+
+
+def test_copies_fill_up_where_there_is_nothing_else():
+    same = UnionSampler([At(0.0, step_m=0.0), At(0.0, step_m=0.0)], LikesRight())
+    assert len(same.sample(CLOUD, 8, 0)) == 8
+
+
+def test_a_hand_turned_over_is_a_copy_and_one_from_elsewhere_or_across_is_not():
+    here, over, across, other_way = (np.eye(4) for _ in range(4))
+    over[:3, :3] = np.diag([-1.0, -1.0, 1.0])
+    across[:3, :3] = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
+    other_way[:3, :3] = np.diag([1.0, -1.0, -1.0])
+    far = np.eye(4)
+    far[0, 3] = 0.004
+    np.testing.assert_array_equal(
+        find_copies(np.stack([here, over, across, other_way, far])), [False, True, False, False, False]
+    )
+
+
+def test_a_copy_of_a_copy_is_kept_when_it_is_no_copy_of_what_is_kept():
+    row = np.tile(np.eye(4), (3, 1, 1))
+    row[:, 0, 3] = [0.0, 0.002, 0.004]
+    np.testing.assert_array_equal(find_copies(row), [False, True, False])
+
+
+def test_a_member_without_grasps_is_passed_over_but_not_all_of_them():
+    assert len(UnionSampler([Refuses(), At(0.0)], LikesRight()).sample(CLOUD, 5, 0)) == 5
+    with pytest.raises(ValueError, match="nothing to hold"):
+        UnionSampler([Refuses(), Refuses()], LikesRight()).sample(CLOUD, 5, 0)
+
+
+def test_bad_clouds_and_lone_members_are_refused():
+    with pytest.raises(ValueError, match="not millimetres"):
+        UnionSampler([At(0.0), At(0.1)], LikesRight()).sample(1000.0 * CLOUD, 5, 0)
+    with pytest.raises(ValueError, match="two or more"):
+        UnionSampler([At(0.0)], LikesRight())
+
+
+def test_sweep_and_diffusion_together_hold_no_worse_than_the_sweep_alone():
+    union = make_generator("union:obb_sweep+diffusion")
+    assert isinstance(union, UnionSampler)
+    assert [type(member) for member in union.members] == [ObbSweepSampler, DiffusionSampler]
+    joined, alone = [], []
+    for seed, family in enumerate(("lathe", "cone", "cup")):
+        rng = np.random.default_rng(70 + seed)
+        solid = make_shape(family, rng)
+        seen = render_view(solid, ViewConfig(occluded_share=0.0), rng)
+        assert seen is not None
+        points, T_camera_object = seen
+        for generator, shares in ((union, joined), (union.members[0], alone)):
+            grasps = generator.sample(points, 150, 0)
+            T = np.linalg.inv(T_camera_object) @ grasps.T_camera_grasps
+            shares.append(check_grasps(solid, T, GRIPPERS["agnostic"]).valid.mean())
+        again = union.sample(points, 150, 0)
+        np.testing.assert_array_equal(again.T_camera_grasps, union.sample(points, 150, 0).T_camera_grasps)
+    assert np.mean(joined) >= np.mean(alone)
+
+
+def test_a_union_is_made_of_any_two_by_name():
+    union = make_generator("union:antipodal+obb_sweep")
+    assert isinstance(union, UnionSampler)
+    assert [type(member) for member in union.members] == [AntipodalSampler, ObbSweepSampler]

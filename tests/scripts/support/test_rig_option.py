@@ -1,0 +1,82 @@
+"""One word chooses the hardware, for `./z1 hal` and `./z1 demo`."""
+
+from __future__ import annotations
+
+import socket
+import subprocess
+import sys
+from importlib.util import find_spec
+
+import pytest
+import tyro
+
+from hal.base.errors import CommandRejectedError, LeaseError
+from hal.bus.client import RemoteArm, RemoteCamera
+from hal.bus.session import BusConfig
+from hal.rig import RIGS
+from scripts.commands import run_demo, run_hal
+from scripts.support.rig_option import RigWord
+from sim_twin.drop_in.rig import free_ports
+
+
+def free_tcp_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "name"),
+    [
+        ([], "sim"),
+        *((["--hal", name], name) for name in RIGS.names()),
+        *(([f"--{name}"], name) for name in RIGS.names()),
+    ],
+)
+def test_every_rig_has_its_word_and_its_name(arguments: list[str], name: str) -> None:
+    assert tyro.cli(run_hal.Config, args=arguments).rig.name == name
+
+
+def test_two_words_are_one_too_many(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        tyro.cli(run_hal.Config, args=["--real", "--sim"])
+    assert "not allowed together" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("word", [RigWord(real=True), RigWord(mock=True)])
+def test_a_demo_of_other_hardware_than_the_twin_is_refused_with_the_way_to_it(word: RigWord) -> None:
+    with pytest.raises(ValueError, match=f"./z1 hal --hal {word.name}, and beside it ./z1 run"):
+        run_demo.Config(rig=word)
+
+
+@pytest.mark.skipif(find_spec("pyrealsense2") is None, reason="pyrealsense2 has no wheel for this platform")
+def test_without_arm_and_camera_the_address_and_the_device_tried_are_named() -> None:
+    command_port, state_port = free_ports()
+    options = [f"--arm.command-port={command_port}", f"--arm.state-port={state_port}", f"--port={free_tcp_port()}"]
+    command = [sys.executable, "-m", "scripts.cli", "hal", "--real", *options]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 1
+    (error,) = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
+    for words in (f"127.0.0.1:{command_port}", f"127.0.0.1:{state_port}", "`z1_ctrl`", "8086:0B5B", "USB 3 port"):
+        assert words in error
+
+
+def test_a_readonly_hal_publishes_states_and_frames_and_commands_nothing() -> None:
+    bus = BusConfig(port=free_tcp_port(), connect_timeout_s=20.0)
+    options = ["--mock", "--readonly", f"--port={bus.port}", "--until-stdin-closes"]
+    command = [sys.executable, "-m", "scripts.cli", "hal", *options]
+    hal = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+    assert hal.stdin is not None and hal.stdout is not None
+    try:
+        assert any(line.strip() == "ready" for line in hal.stdout), "the HAL process ended at its start"
+        with RemoteArm(bus) as arm, RemoteCamera(bus) as camera:
+            assert arm.read_state().q.shape == (7,)
+            assert camera.wait_for_frame(20.0).depth_m.any()
+            with pytest.raises(LeaseError, match="only watches"):
+                arm.claim()
+            with pytest.raises(CommandRejectedError, match="cannot stop the arm"):
+                arm.stop("a hand came near")
+    finally:
+        hal.stdin.close()
+        assert hal.wait() == 0
+        hal.stdout.close()

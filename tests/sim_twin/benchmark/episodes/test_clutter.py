@@ -1,0 +1,125 @@
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+import pytest
+
+from models.types import Detection
+from sim_twin.benchmark.episodes.scenarios import Scenario, grid
+from sim_twin.benchmark.episodes.targeting import PointedDetector, aim, overlap
+from sim_twin.benchmark.episodes.trial import look
+from sim_twin.benchmark.episodes.watch import Watch
+from sim_twin.model.objects import EXTENDED_OBJECTS, OBJECTS
+from sim_twin.model.scene import Neighbour
+from sim_twin.model.world import World
+from z1_runtime.config import RuntimeConfig
+from z1_runtime.geometry.kinematics import Kinematics
+from z1_runtime.perception.detectors import TabletopDetector
+
+CLUTTERED = Scenario(object="cylinder", distance="mid", lateral="left", pitch_deg=0.0, clutter=3)
+
+
+def footprint(scene):
+    """Return where (2,) each thing stands and how far it reaches from there [m], the object first."""
+    pose = scene.T_base_object()
+    things = [(pose, scene.thing)]
+    things += [(neighbour.T_base_object(), OBJECTS[neighbour.object]) for neighbour in scene.neighbours]
+    return [(T[:2, 3], np.hypot(*(thing.corners() @ T[:3, :3].T)[:, :2].T).max()) for T, thing in things]
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_neighbours_stand_apart_from_the_object_and_from_each_other_and_not_before_it(count):
+    for scenario in grid(clutters=(count,)):
+        scene = scenario.scene()
+        (middle, radius_m), *others = footprint(scene)
+        assert len(others) == count
+        for where, own_m in others:
+            assert 0.069 < np.linalg.norm(where - middle) - radius_m - own_m < 0.131
+            assert (where - middle) @ middle / np.linalg.norm(middle) > -0.5 * np.linalg.norm(where - middle)
+        for (a, r), (b, s) in combinations(others, 2):
+            assert np.linalg.norm(a - b) > r + s
+        assert scenario.object not in {neighbour.object for neighbour in scene.neighbours}
+
+
+def test_the_same_scenario_has_the_same_neighbours_and_the_row_names_them():
+    assert CLUTTERED.scene() == CLUTTERED.scene()
+    assert len({s.scene().neighbours for s in grid(clutters=(2,))}) == 81
+    assert CLUTTERED.features()["neighbours"] == [n.object for n in CLUTTERED.scene().neighbours]
+    assert Scenario.of(CLUTTERED.features()) == CLUTTERED
+
+
+def test_the_extended_sets_neighbours_are_of_that_set():
+    for scenario in grid(("mug", "plate"), clutters=(3,)):
+        assert {n.object for n in scenario.scene().neighbours} <= set(EXTENDED_OBJECTS)
+
+
+def test_neighbours_stand_and_one_that_is_pushed_over_is_counted():
+    world = World(CLUTTERED.scene())
+    watch = Watch(world)
+    world.advance_to(0.5)
+    assert watch.neighbours_knocked() == 0
+    start = world.model.joint("neighbour_1").qposadr[0]
+    world.data.qpos[start + 3 : start + 7] = [0.9, 0.43, 0.0, 0.0]
+    world.advance_to(1.0)
+    assert watch.neighbours_knocked() == 1
+    np.testing.assert_allclose(world.T_base_object()[:3, 3], CLUTTERED.scene().T_base_object()[:3, 3], atol=2e-3)
+
+
+@pytest.mark.parametrize("lateral", ["left", "right"])
+def test_a_detector_without_classes_is_pointed_at_the_object(lateral):
+    scenario = replace(CLUTTERED, lateral=lateral)
+    config, detector = aim(RuntimeConfig(), TabletopDetector(), scenario)
+    assert config.object_class == ""
+    frame, q = look(scenario.scene())
+    T_base_camera = Kinematics().flange(q[:6]) @ scenario.scene().T_flange_camera()
+    assert len(TabletopDetector().detect(frame, T_base_camera)) > 1
+    (found,) = detector.detect(frame, T_base_camera)
+    assert overlap(found, frame.truth_mask) > 0.6
+    gone = replace(frame, truth_mask=np.zeros_like(frame.truth_mask))
+    assert detector.detect(gone, T_base_camera) == []
+
+
+class Labelled:
+    """A detector that knows the paper's classes."""
+
+    classes, min_confidence = ("bottle", "box", "cylinder"), 0.5
+
+
+class OfCoco(Labelled):
+    classes = ("bottle", "book", "dog")
+
+
+def test_a_detector_with_classes_is_told_the_objects_class():
+    for clutter in (0, 2):
+        detector = Labelled()
+        config, same = aim(RuntimeConfig(object_class="box"), detector, replace(CLUTTERED, clutter=clutter))
+        assert config.object_class == "cylinder"
+        assert same is detector
+
+
+def test_a_detector_that_lacks_a_class_of_the_papers_is_refused():
+    with pytest.raises(ValueError, match="does not know 'cylinder'; it knows: bottle, book, dog"):
+        aim(RuntimeConfig(), OfCoco(), CLUTTERED)
+
+
+def test_an_object_of_no_class_is_seen_as_the_user_chose_or_by_its_rising_above_the_table():
+    mug = replace(CLUTTERED, object="mug", clutter=0)
+    config, detector = aim(RuntimeConfig(object_class="bottle"), Labelled(), mug)
+    assert config.object_class == "bottle"
+    assert isinstance(detector, Labelled)
+    assert isinstance(aim(RuntimeConfig(), Labelled(), mug)[1], TabletopDetector)
+    assert isinstance(aim(RuntimeConfig(), Labelled(), replace(mug, clutter=1))[1], PointedDetector)
+
+
+def test_a_box_counts_where_there_is_no_mask():
+    truth = np.zeros((10, 10), dtype=bool)
+    truth[2:6, 4:8] = True
+    assert overlap(Detection(label="x", confidence=1.0, box_px=(4, 2, 8, 6)), truth) == 1.0
+    assert overlap(Detection(label="x", confidence=1.0, box_px=(4, 2, 8, 4)), truth) == 0.5
+
+
+def test_a_neighbour_that_does_not_exist_is_refused():
+    with pytest.raises(ValueError, match="no object 'banana'"):
+        Neighbour(object="banana", x_m=0.5, y_m=0.0)
+    with pytest.raises(ValueError, match="0 to 3 neighbours"):
+        replace(CLUTTERED, clutter=4)

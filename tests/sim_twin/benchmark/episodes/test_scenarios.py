@@ -1,0 +1,44 @@
+import pytest
+
+from sim_twin.benchmark.episodes.scenarios import OBJECT_SETS, PAPER_OBJECTS, Scenario, grid
+from sim_twin.model.objects import EXTENDED_OBJECTS
+
+
+def test_the_paper_has_81_scenarios_and_each_has_its_own_name_and_noise():
+    scenarios = grid()
+    assert len(scenarios) == 81
+    assert len({s.key for s in scenarios}) == len({s.draw_seed for s in scenarios}) == 81
+    assert {s.object for s in scenarios} == set(PAPER_OBJECTS)
+
+
+def test_every_scenario_is_one_that_the_twin_can_build():
+    for scenario in grid(occlusions=(0.0, 0.5)):
+        scene = scenario.scene()
+        assert scene.T_base_object()[0, 3] == pytest.approx({"near": 0.40, "mid": 0.48, "far": 0.56}[scenario.distance])
+
+
+def test_the_extended_set_stands_upright_in_nine_poses_an_object():
+    scenarios = grid(objects=OBJECT_SETS["extended"])
+    assert len(scenarios) == 9 * len(EXTENDED_OBJECTS)
+    assert {s.pitch_deg for s in scenarios} == {0.0}
+
+
+def test_seeds_and_occlusions_multiply_the_poses():
+    scenarios = grid(objects=("box",), seeds=(0, 1), occlusions=(0.0, 0.25, 0.5))
+    assert len(scenarios) == 27 * 2 * 3
+    assert len({s.key for s in scenarios}) == len(scenarios)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "said"),
+    [
+        ("object", "banana", "bottle"),
+        ("distance", "close", "near"),
+        ("occlusion", 1.0, "0 up to"),
+        ("seed", -1, "seed"),
+    ],
+)
+def test_an_impossible_scenario_says_what_is_possible(field, value, said):
+    good = {"object": "box", "distance": "mid", "lateral": "left", "pitch_deg": 0.0}
+    with pytest.raises(ValueError, match=said):
+        Scenario(**{**good, field: value})

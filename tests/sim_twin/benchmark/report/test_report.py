@@ -1,0 +1,164 @@
+import re
+from base64 import b64encode
+from itertools import pairwise
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+from sim_twin.benchmark.episodes.scenarios import grid
+from sim_twin.benchmark.report import svg
+from sim_twin.benchmark.report.pictures import Picture
+from sim_twin.benchmark.report.report import write_report
+from sim_twin.benchmark.results.summary import STAGES, summarise
+
+MODES = ("missed", "object knocked", "no IK", "no path", "slipped", "dropped", "table collision", "no candidate")
+
+
+def make_rows(methods, objects=("bottle", "box", "cylinder"), occlusions=(0.0,)):
+    """Return rows whose rates grow with the method's number, with the gaps that real rows have."""
+    rng, rows = np.random.default_rng(0), []
+    for scenario in grid(objects, occlusions=occlusions):
+        for k, method in enumerate(methods):
+            success = bool(rng.random() < (k + 1) / (len(methods) + 1))
+            rank = int(rng.integers(3))
+            mode = "success" if success else MODES[rng.integers(len(MODES))]
+            row = {**scenario.features(), "method": method, "success": success, "mode": mode}
+            row |= {"success_top1": success and rank == 0, "n_candidates": 800, "n_free": 300, "n_ranked": 120}
+            row |= {"detect_ms": 20.0, "generate_ms": rng.uniform(100.0, 200.0), "rejected_ik": int(rng.integers(9))}
+            rows.append(row | ({"rank": rank, "plan_ms": None} if mode != "no candidate" else {"n_free": -1}))
+    return rows
+
+
+def write(path, rows, **more):
+    write_report(rows, {"run": {"version": "1.2", "command": {"jobs": 2}}, **summarise(rows)}, path, **more)
+    return path.read_text()
+
+
+@pytest.fixture
+def page(tmp_path):
+    return write(tmp_path / "report.html", make_rows(("vanilla", "mvb", "full"), occlusions=(0.0, 0.25)))
+
+
+def test_the_page_needs_no_other_file(page):
+    assert not re.findall(r"""(?:src|href)\s*=\s*['"](?!data:)|@import|url\(|<script""", page)
+
+
+def test_every_plot_is_well_formed(page):
+    plots = re.findall(r"<svg.*?</svg>", page, re.DOTALL)
+    assert len(plots) == 5 * 2 + 3 * 2 + 1
+    for plot in plots:
+        ElementTree.fromstring(plot)
+
+
+def test_the_headline_says_both_readings_beside_the_papers(tmp_path):
+    rows = make_rows(("vanilla", "mvb", "full"))
+    page = write(tmp_path / "report.html", rows)
+    for method, paper in (("vanilla", "24.7% of 81"), ("mvb", "59.3% of 81"), ("full", "–")):
+        own = [row for row in rows if row["method"] == method]
+        rates = [np.mean([row[column] for row in own]) for column in ("success", "success_top1")]
+        line = next(line for line in page.split("<tr>") if line.startswith(f"<td>{method}</td><td>81</td>"))
+        assert f"<td>{rates[0]:.1%}</td>" in line
+        assert f"<td>{rates[1]:.1%}</td>" in line
+        assert f"<td>{paper}</td>" in line
+
+
+def test_conditions_stand_in_the_order_people_count_them(page):
+    words = re.findall(r"<text[^>]*>([^<]*)</text>", page)
+    assert words.index("near") < words.index("mid") < words.index("far")
+    assert words.index("left") < words.index("centre") < words.index("right")
+    assert words.index("-45") < words.index("0") < words.index("45")
+
+
+def test_methods_stand_in_their_order_whatever_the_rows(tmp_path):
+    page = write(tmp_path / "report.html", make_rows(("full", "mvb:k=3", "mvb", "vanilla")))
+    assert re.findall(r"<tr><td>([^<]*)</td><td>81</td>", page) == ["vanilla", "mvb:k=3", "mvb", "full"]
+
+
+def test_a_count_that_was_never_made_is_no_count(tmp_path):
+    rows = [row | {"n_free": -1} for row in make_rows(("mvb",))]
+    line = next(
+        line for line in write(tmp_path / "r.html", rows).split("<tr>") if line.startswith("<td>mvb</td><td>800")
+    )
+    assert line.startswith("<td>mvb</td><td>800</td><td>–</td><td>120</td>")
+
+
+def test_one_method_alone_and_names_with_markup_are_shown_too(tmp_path):
+    page = write(tmp_path / "report.html", make_rows(("mvb:k=3<b>",), objects=("mug",)))
+    assert "nothing to compare" in page
+    assert "<b>" not in page
+
+
+def test_pictures_are_in_the_page(tmp_path):
+    page = write(
+        tmp_path / "report.html",
+        make_rows(("mvb",)),
+        pictures=[Picture(words="box: missed", jpeg=b"jpeg", recording="recordings/a b.rrd")],
+    )
+    assert f"data:image/jpeg;base64,{b64encode(b'jpeg').decode()}" in page
+    assert "box: missed" in page
+    assert "href='recordings/a%20b.rrd'" in page
+
+
+def test_bars_are_as_long_as_the_rates_and_nothing_lies_on_another():
+    plot = svg.rate_bars(["a", "b"], {"x": [(1, 4), (0, 0)], "y": [(4, 4), (2, 4)]}, "caption")
+    (drawing,) = re.findall(r"<svg.*</svg>", plot)
+    root = ElementTree.fromstring(drawing)
+    bars = [
+        {key: float(bar.attrib[key]) for key in ("y", "width", "height")}
+        for bar in root.iter()
+        if bar.tag[-4:] == "rect"
+    ]
+    assert [bar["width"] / bars[1]["width"] for bar in bars] == pytest.approx([0.25, 1.0, 0.5])
+    bars.sort(key=lambda bar: bar["y"])
+    assert all(one["y"] + one["height"] < other["y"] for one, other in pairwise(bars))
+    assert "no episodes" in plot
+
+
+def test_shares_fill_the_bar_and_the_first_leads():
+    plot = svg.share_bars({"mvb": {"missed": 1, "success": 3}}, "success", "caption")
+    widths = [float(w) for w in re.findall(r'<rect[^>]* width="([\d.]+)"', plot)]
+    assert widths[0] == pytest.approx(3 * widths[1])
+    assert plot.index("success</span>") < plot.index("missed</span>")
+
+
+def test_the_papers_known_figures_stand_beside_ours_and_no_others(page):
+    start = page.index("<h2>The paper's tables, and ours</h2>")
+    tables = page[start : page.index("<h2>Methods against each other")]
+    assert re.findall(r"<h3>(\d)", tables) == ["1", "2", "3", "4", "5"]
+    papers = re.findall(r"<tr>(<td></td><td>the paper&#x27;s</td>.*?)</tr>", tables)
+    assert len(papers) == 3 * 2
+    for line, rate in zip(papers, ("24.7%", "59.3%") * 3, strict=True):
+        figures = re.findall("<td>(.*?)</td>", line)[2:]
+        assert figures[0] == rate
+        assert set(figures[1:]) == {"–"}
+    assert re.findall("<td>the paper&#x27;s</td><td></td>(.*)", tables)[0].count("–") == len(STAGES) + 1 - 3
+
+
+def test_tables_give_the_rate_of_each_condition(tmp_path):
+    rows = make_rows(("mvb",))
+    page = write(tmp_path / "report.html", rows)
+    boxes = [row["success"] for row in rows if row["object"] == "box"]
+    (head,) = re.findall(r"<h3>2 By object</h3>.*?<tr>(.*?)</tr>", page)
+    assert re.findall("<th>(.*?)</th>", head) == ["method", "", "all", "bottle", "box", "cylinder"]
+    (line,) = re.findall(r"<h3>2 By object</h3>.*?<tr>.*?</tr><tr>(.*?)</tr>", page)
+    assert re.findall("<td>(.*?)</td>", line)[4] == f"{np.mean(boxes):.1%}"
+
+
+def test_retries_neighbours_and_noise_are_shown_where_there_were_any(tmp_path):
+    rows = make_rows(("mvb",))
+    for k, row in enumerate(rows):
+        after = [False, k % 2 == 0, k % 4 != 1]
+        row |= {
+            "top_k": 3,
+            "attempts": 2,
+            "success_after": after,
+            "clutter": k % 3,
+            "neighbours_knocked": int(k % 9 == 1),
+        }
+    page = write(tmp_path / "report.html", rows)
+    assert "<td>mvb</td><td>0.0%</td><td>50.6%</td><td>75.3%</td><td>2.00</td>" in page
+    assert "<h2>Neighbours</h2>" in page
+    assert "15 mm or 15°: mvb 9 of 54." in page
+    plain = write(tmp_path / "plain.html", make_rows(("mvb",)))
+    assert not any(words in plain for words in ("Retries", "Neighbours", "Physics noise"))

@@ -1,0 +1,74 @@
+import numpy as np
+import pytest
+
+from sim_twin.benchmark.results.stats import mcnemar, paired_difference, wilson
+
+
+def test_wilson_gives_the_textbook_interval():
+    # Newcombe 1998, table I: 81 of 263
+    low, high = wilson(81, 263)
+    assert (low, high) == pytest.approx((0.2553, 0.3662), abs=1e-4)
+
+
+def test_wilson_stays_inside_0_to_1_at_the_ends():
+    assert wilson(0, 10)[0] == 0.0
+    assert wilson(0, 10)[1] == pytest.approx(0.2775, abs=1e-4)
+    assert wilson(10, 10)[1] == 1.0
+    assert wilson(0, 0) == (0.0, 1.0)
+
+
+def test_wilson_refuses_more_successes_than_trials():
+    with pytest.raises(ValueError, match="11 successes in 10"):
+        wilson(11, 10)
+
+
+def test_mcnemar_counts_only_where_the_two_differ():
+    first = np.array([1] * 10 + [0] * 2 + [1] * 50 + [0] * 50, dtype=bool)
+    second = np.array([0] * 10 + [1] * 2 + [1] * 50 + [0] * 50, dtype=bool)
+    test = mcnemar(first, second)
+    assert (test.only_first, test.only_second) == (10, 2)
+    assert test.p == pytest.approx(2 * 79 / 4096)  # 2 · (C(12,0) + C(12,1) + C(12,2)) / 2¹²
+
+
+def test_mcnemar_of_equals_finds_no_difference():
+    assert mcnemar(np.ones(5, bool), np.ones(5, bool)).p == 1.0
+
+
+def test_mcnemar_refuses_what_is_not_paired():
+    with pytest.raises(ValueError, match="paired"):
+        mcnemar(np.ones(5), np.ones(6))
+
+
+def pairs(both: int, only_first: int, only_second: int, neither: int) -> tuple[np.ndarray, np.ndarray]:
+    first = np.repeat([1, 1, 0, 0], [both, only_first, only_second, neither])
+    second = np.repeat([1, 0, 1, 0], [both, only_first, only_second, neither])
+    return first.astype(bool), second.astype(bool)
+
+
+def test_the_difference_of_two_methods_lies_in_its_interval_and_turns_round_with_them():
+    first, second = pairs(40, 20, 6, 15)
+    low, high = paired_difference(first, second)
+    assert low < 14 / 81 < high
+    assert low > 0  # McNemar: p = 0.009
+    assert paired_difference(second, first) == pytest.approx((-high, -low))
+
+
+def test_methods_that_agree_are_told_apart_more_finely_than_those_that_do_not():
+    agreeing = np.diff(paired_difference(*pairs(40, 8, 0, 33)))[0]
+    at_odds = np.diff(paired_difference(*pairs(20, 28, 20, 13)))[0]
+    assert agreeing < 0.6 * at_odds
+
+
+def test_the_interval_holds_the_true_difference_about_as_often_as_it_says():
+    rng = np.random.default_rng(0)
+    chances = np.array([0.45, 0.20, 0.08, 0.27])
+    held = 0
+    for _ in range(600):
+        low, high = paired_difference(*pairs(*rng.multinomial(81, chances)))
+        held += low <= 0.12 <= high
+    assert 0.925 < held / 600 < 0.985
+
+
+def test_a_difference_of_nothing_is_refused():
+    with pytest.raises(ValueError, match="needs scenarios"):
+        paired_difference(np.zeros(0, bool), np.zeros(0, bool))

@@ -1,0 +1,265 @@
+"""The detector's pictures: what the labels say is what the picture shows."""
+
+from collections.abc import Iterator
+from typing import get_args
+
+import mujoco
+import numpy as np
+import pytest
+
+from hal.base import z1
+from sim_twin.camera.d405 import INTRINSICS
+from sim_twin.camera.render import make_renderer
+from sim_twin.detection_data.photometric_noise import spoil_photo
+from sim_twin.detection_data.props import CLASSES, HIDDEN_GROUP, make_class_prop, make_distractor, nominal_prop
+from sim_twin.detection_data.scene_renderer import Stage
+from sim_twin.detection_data.scenes import (
+    LEAST_MARK_SHARE,
+    LEAST_PIXELS,
+    LEAST_SHARE,
+    Look,
+    SceneMix,
+    draw_scenario,
+    draw_scene,
+    outline,
+    seen_share,
+)
+from sim_twin.detection_data.textures import random_texture
+from sim_twin.model.objects import OBJECTS
+from sim_twin.model.scene import SceneConfig
+from sim_twin.model.world import World
+from tests.support.gl_here import needs_egl
+
+HOME = np.append(z1.Q_HOME, -1.0)
+
+
+@pytest.fixture(scope="module")
+def stage() -> Iterator[Stage]:
+    made = Stage(7)
+    yield made
+    made.close()
+
+
+@needs_egl
+def test_the_same_seed_gives_the_same_picture_and_another_seed_another(stage: Stage) -> None:
+    first, again, other = (draw_scene(stage, np.random.default_rng(seed)) for seed in (3, 3, 4))
+    assert np.array_equal(first.colour, again.colour)
+    assert [label.name for label in first.labels] == [label.name for label in again.labels]
+    assert all(np.array_equal(a.mask, b.mask) for a, b in zip(first.labels, again.labels, strict=True))
+    assert not np.array_equal(first.colour, other.colour)
+
+
+@needs_egl
+def test_labels_are_of_the_three_classes_large_enough_and_apart(stage: Stage) -> None:
+    seen = 0
+    for seed in range(12):
+        picture = draw_scene(stage, np.random.default_rng(seed), SceneMix(empty=0.0))
+        assert picture.colour.shape == (INTRINSICS.height, INTRINSICS.width, 3)
+        for label in picture.labels:
+            assert label.name in CLASSES
+            assert label.mask.sum() >= LEAST_PIXELS
+            left, top, right, bottom = label.box()
+            outside = label.mask.copy()
+            outside[top:bottom, left:right] = False
+            assert not outside.any()
+            assert label.mask[top, :].any() and label.mask[bottom - 1, :].any()
+            assert label.mask[:, left].any() and label.mask[:, right - 1].any()
+        stacked = sum(label.mask.astype(int) for label in picture.labels)
+        assert np.max(stacked) <= 1
+        seen += len(picture.labels)
+    assert seen >= 6
+
+
+@needs_egl
+def test_an_empty_scene_has_no_labels(stage: Stage) -> None:
+    for seed in range(4):
+        assert draw_scene(stage, np.random.default_rng(seed), SceneMix(empty=1.0)).labels == ()
+
+
+@needs_egl
+@pytest.mark.parametrize("name", CLASSES)
+def test_a_scenario_has_the_mask_that_the_twin_has(stage: Stage, name: str) -> None:
+    config = SceneConfig(object=name, distance_m=0.48, lateral_m=-0.15, pitch_deg=45.0)
+    pose = config.T_base_object()
+    picture = draw_scenario(stage, name, pose, np.random.default_rng(0), look="any")
+    world = World(config)
+    data = world.snapshot()
+    quat = np.empty(4)
+    mujoco.mju_mat2Quat(quat, pose[:3, :3].ravel().copy())
+    data.qpos[:] = [*HOME, *pose[:3, 3], *quat]
+    mujoco.mj_forward(world.model, data)
+    renderer = make_renderer(world.model, INTRINSICS, "egl")
+    twin = renderer.render(data).mask
+    renderer.close()
+    ours = picture.labels[0].mask
+    assert (ours & twin).sum() / (ours | twin).sum() > 0.99
+
+
+@needs_egl
+@pytest.mark.parametrize("look", get_args(Look))
+def test_an_object_has_its_own_colours_unless_any_will_do(stage: Stage, look: Look) -> None:
+    actor, pose = stage.named("cylinder")[0], SceneConfig(object="cylinder").T_base_object()
+    own = [part.rgba for part, _ in actor.prop.parts]
+    alike = []
+    for seed in range(5):
+        assert draw_scenario(stage, "cylinder", pose, np.random.default_rng(seed), look=look).look == look
+        untextured = (stage.model.geom_matid[actor.geoms] < 0).all()
+        alike.append(untextured and np.allclose(stage.model.geom_rgba[actor.geoms], own))
+    assert any(alike) == all(alike) == (look != "any")
+
+
+@needs_egl
+def test_what_an_occluder_covers_belongs_to_no_label_and_what_hardly_shows_is_taken_away(stage: Stage) -> None:
+    T_base_camera = stage.set_arm(HOME)
+    cylinder, card = stage.named("cylinder")[0], stage.distractors()[0]
+    pose = SceneConfig(object="cylinder").T_base_object()
+    stage.clear()
+    stage.put(cylinder, pose)
+    alone = stage.draw_instances("wrist", "pieces") == stage.actors.index(cylinder)
+    between = np.eye(4)
+    between[:3, 3] = 0.6 * pose[:3, 3] + 0.4 * T_base_camera[:3, 3]
+    stage.put(card, between)
+    instances = stage.draw_instances("wrist", "pieces")
+    behind = instances == stage.actors.index(cylinder)
+    assert behind.sum() < alone.sum()
+    assert not (behind & ~alone).any()
+    assert (instances == stage.actors.index(card)).any()
+    stage.hide(cylinder)
+    assert not (stage.draw_instances("wrist", "pieces") == stage.actors.index(cylinder)).any()
+
+
+@needs_egl
+def test_every_label_shows_enough_of_its_outline(stage: Stage) -> None:
+    for seed in range(20, 32):
+        picture = draw_scene(stage, np.random.default_rng(seed), SceneMix(empty=0.0, wrist=0.0, occluded=1.0))
+        camera = stage.T_base_camera("free")
+        for label in picture.labels:
+            areas = []
+            for actor in stage.named(label.name):
+                pose = stage.pose(actor)
+                corners = [points @ pose[:3, :3].T + pose[:3, 3] for points in actor.prop.corners()]
+                whole = outline(corners, camera, stage.intrinsics)
+                areas.append(np.inf if whole is None else 4 * whole.sum())
+            assert label.mask.sum() >= min(LEAST_SHARE * min(areas), 0.08 * label.mask.size)
+
+
+@needs_egl
+def test_a_bottle_without_its_neck_has_no_label_where_colours_tell_nothing(stage: Stage) -> None:
+    """Its shoulder cut off by the picture's border, a bottle in random colours is a cylinder."""
+    seen = {True: 0, False: 0}
+    for seed in range(40, 100):
+        rng = np.random.default_rng(seed)
+        picture = draw_scene(stage, rng, SceneMix(empty=0.0, twin=0.0, own=0.0, wrist=0.0, occluded=0.0))
+        camera = stage.T_base_camera("free")
+        shown = [a for a in stage.named("bottle") if stage.model.geom_group[a.geoms[0]] != HIDDEN_GROUP]
+        masks = [label.mask for label in picture.labels if label.name == "bottle"]
+        for actor, mask in zip(shown, masks, strict=True) if len(shown) == len(masks) == 1 else []:
+            pose = stage.pose(actor)
+            corners = [points @ pose[:3, :3].T + pose[:3, 3] for points in actor.prop.corners()[-2:]]
+            neck = outline(corners, camera, stage.intrinsics)
+            assert neck is not None
+            seen[seen_share(mask, neck) >= LEAST_MARK_SHARE] += 1
+    assert seen[True] >= 5
+    assert seen[False] == 0
+
+
+def test_the_outline_of_a_plate_square_to_the_camera_is_its_size_in_pixels() -> None:
+    plate = np.array([[x, y, 0.5] for x in (-0.05, 0.05) for y in (-0.03, 0.03)])
+    wanted = 0.10 * INTRINSICS.fx / 0.5 * 0.06 * INTRINSICS.fy / 0.5
+    whole = outline([plate], np.eye(4), INTRINSICS)
+    assert whole is not None
+    assert 4 * whole.sum() == pytest.approx(wanted, rel=0.06)
+    mask = np.zeros((INTRINSICS.height, INTRINSICS.width), dtype=bool)
+    mask[:, : round(INTRINSICS.cx)] = True
+    assert seen_share(mask, whole) == pytest.approx(0.5, abs=0.02)
+
+
+def test_what_comes_too_near_the_lens_has_no_outline() -> None:
+    assert outline([np.array([[0.0, 0.0, 0.03], [0.0, 0.1, 0.3]])], np.eye(4), INTRINSICS) is None
+
+
+def test_props_keep_the_proportions_that_tell_them_from_distractors() -> None:
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        box = np.ptp(np.vstack(make_class_prop("box", rng).corners()), axis=0)
+        assert box.min() >= 0.028
+        cylinder = np.ptp(np.vstack(make_class_prop("cylinder", rng).corners()), axis=0)
+        assert cylinder[2] >= 1.69 * cylinder[0]
+        bottle = make_class_prop("bottle", rng)
+        assert len(bottle.parts) == len(OBJECTS["bottle"].parts) + 1
+        assert make_distractor(rng).kind not in CLASSES
+    assert np.ptp(np.vstack(nominal_prop("bottle").corners()), axis=0)[2] == pytest.approx(0.200)
+
+
+def test_a_label_high_up_ends_below_the_shoulder() -> None:
+    class Extreme:
+        def uniform(self, low: float, high: float, size: int | None = None) -> float | np.ndarray:
+            return low if size is None else np.full(size, high)  # the label's two edges are drawn at once
+
+    bottle = make_class_prop("bottle", Extreme())  # pyright: ignore[reportArgumentType]
+    assert all(min(part.size_m) > 0.0 for part, _ in bottle.parts)
+
+
+def test_textures_are_pictures_and_come_from_their_seed() -> None:
+    for seed in range(30):
+        picture = random_texture(np.random.default_rng(seed), 64)
+        assert picture.shape == (64, 64, 3) and picture.dtype == np.uint8
+        assert np.array_equal(picture, random_texture(np.random.default_rng(seed), 64))
+    assert len({random_texture(np.random.default_rng(seed), 64).tobytes() for seed in range(30)}) == 30
+
+
+def test_a_photograph_is_noisy_in_every_channel_and_brought_to_a_fair_exposure() -> None:
+    dark = np.full((120, 160, 3), 12, np.uint8)
+    noise = []
+    for seed in range(20):
+        photo = spoil_photo(dark, np.random.default_rng(seed))
+        assert photo.shape == dark.shape and photo.dtype == np.uint8
+        assert photo.mean() > dark.mean()
+        noise.append(photo.std(axis=(0, 1)))
+    assert (np.median(noise, axis=0) > 1.0).all()
+
+
+@needs_egl
+def test_a_crowd_shows_more_objects(stage: Stage) -> None:
+    def shown(crowd: float) -> list[int]:
+        mix = SceneMix(empty=0.0, twin=0.0, own=0.0, crowd=crowd)
+        return [len(draw_scene(stage, np.random.default_rng([5, n]), mix).labels) for n in range(8)]
+
+    few, many = shown(0.0), shown(1.0)
+    assert max(few) <= 3
+    assert sum(many) > sum(few)
+    assert max(many) > 3
+
+
+@needs_egl
+def test_more_of_what_is_no_object_stands_about_when_asked(stage: Stage) -> None:
+    def shown(distractors: float) -> int:
+        mix = SceneMix(crowd=0.5, occluded=0.0, distractors=distractors)
+        counts = []
+        for n in range(8):
+            draw_scene(stage, np.random.default_rng([6, n]), mix)
+            counts.append(sum(stage.shows(actor) for actor in stage.distractors()))
+        return sum(counts)
+
+    none, some, many = shown(0.0), shown(2.0), shown(6.0)
+    assert none == 0
+    assert 0 < some < many
+
+
+@needs_egl
+def test_every_mug_shows_its_handle(stage: Stage) -> None:
+    """Without it a mug is a cylinder, which a picture must not show without a label."""
+    seen = 0
+    for seed in range(200, 260):
+        draw_scene(stage, np.random.default_rng(seed), SceneMix(empty=1.0, wrist=0.0))
+        for mug in stage.distractors():
+            if mug.prop.kind != "mug" or not stage.shows(mug):
+                continue
+            number = stage.actors.index(mug)
+            whole = stage.draw_instances("free", "none") == number
+            stage.model.geom_group[mug.geoms[2:]] = HIDDEN_GROUP
+            without = stage.draw_instances("free", "none") == number
+            stage.put(mug, stage.pose(mug))
+            assert (whole & ~without).sum() > 0.04 * whole.sum()
+            seen += 1
+    assert seen >= 3

@@ -1,0 +1,162 @@
+"""The twin behind real ports, by the wall clock, and the real arm's driver against it."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pytest
+
+from hal.backends.z1.arm import Z1Arm
+from hal.backends.z1.config import Z1ArmConfig
+from hal.base import z1
+from hal.base.clock import WallClock
+from hal.base.errors import HalError, LeaseError
+from hal.z1_protocol.controller import LABELS, decode_state, encode_command
+from hal.z1_protocol.records import JointCommands
+from hal.z1_protocol.states import Fsm
+from sim_twin.controller.controlled_world import ControlledWorld
+from sim_twin.drop_in.config import WireConfig
+from sim_twin.drop_in.rig import free_ports
+from sim_twin.drop_in.udp_server import WireServer
+from sim_twin.model.scene import SceneConfig
+from sim_twin.model.world import World
+
+
+def make_server() -> WireServer:
+    command_port, state_port = free_ports()
+    config = WireConfig(command_port=command_port, state_port=state_port)
+    return WireServer(ControlledWorld(World(SceneConfig())), config)
+
+
+@pytest.fixture
+def server() -> Iterator[WireServer]:
+    with make_server() as made:
+        yield made
+
+
+class Client:
+    """A socket at the port that is answered to."""
+
+    def __init__(self, config: WireConfig) -> None:
+        self._to = (config.host, config.command_port)
+        self.socket = socket.socket(type=socket.SOCK_DGRAM)
+        self.socket.bind((config.client_host, config.state_port))
+        self.socket.settimeout(10.0)
+
+    def exchange(self, data: bytes) -> bytes:
+        self.socket.sendto(data, self._to)
+        return self.socket.recv(4096)
+
+    def __enter__(self) -> Client:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.socket.close()
+
+
+def await_true(condition: Callable[[], bool], timeout_s: float = 30.0) -> None:
+    clock = WallClock()
+    end_s = clock.now_s() + timeout_s
+    while not condition():
+        assert clock.now_s() < end_s
+        clock.sleep_until(clock.now_s() + 0.005)
+
+
+def test_a_command_is_answered_and_obeyed(server: WireServer) -> None:
+    with Client(server.config) as client:
+        assert decode_state(client.exchange(encode_command(Fsm.INVALID))).state is Fsm.PASSIVE
+        answer = decode_state(client.exchange(encode_command(Fsm.JOINTCTRL)))
+    assert answer.state is Fsm.JOINTCTRL
+    assert answer.joints.q[:6] == pytest.approx(z1.Q_HOME, abs=0.1)
+
+
+def test_garbage_is_dropped_and_the_next_command_answered(server: WireServer) -> None:
+    rng = np.random.default_rng(0)
+    with Client(server.config) as client:
+        for size in (0, 1, 146, 148, 1400, 9000):
+            client.socket.sendto(rng.bytes(size), (server.config.host, server.config.command_port))
+        assert decode_state(client.exchange(encode_command(Fsm.INVALID))).state is Fsm.PASSIVE
+    assert server.twin.refused == 6
+    assert server.alive
+
+
+def test_a_client_that_is_gone_is_not_missed(server: WireServer) -> None:
+    with Client(server.config) as client:
+        q = decode_state(client.exchange(encode_command(Fsm.JOINTCTRL))).joints.q
+        q[0] += 0.5
+        client.exchange(encode_command(Fsm.INVALID, JointCommands(q=q), track=True))
+    await_true(lambda: abs(server.twin.world.read_arm()[0][0] - q[0]) < 0.01)
+    assert server.twin.controller.fsm is Fsm.JOINTCTRL
+    with Client(server.config) as client:
+        assert decode_state(client.exchange(encode_command(Fsm.INVALID))).joints.q[0] == pytest.approx(q[0], abs=0.05)
+
+
+def test_a_second_client_is_obeyed_and_the_first_hears_of_it(server: WireServer) -> None:
+    with Client(server.config) as first, socket.socket(type=socket.SOCK_DGRAM) as second:
+        assert decode_state(first.exchange(encode_command(Fsm.INVALID))).state is Fsm.PASSIVE
+        second.sendto(encode_command(Fsm.JOINTCTRL), (server.config.host, server.config.command_port))
+        assert decode_state(first.socket.recv(4096)).state is Fsm.JOINTCTRL
+        second.settimeout(0.05)
+        with pytest.raises(TimeoutError):
+            second.recv(4096)
+
+
+def test_a_port_that_is_taken_is_named(server: WireServer) -> None:
+    with pytest.raises(LeaseError, match=rf"port 127\.0\.0\.1:{server.config.command_port} is taken"):
+        WireServer(server.twin, server.config).start()
+
+
+def test_an_address_of_another_machine_is_refused(server: WireServer) -> None:
+    with pytest.raises(HalError, match="Choose an address of this machine"):
+        WireServer(server.twin, WireConfig(host="192.0.2.1")).start()
+    with pytest.raises(ValueError, match="allowed are 1 to 65535"):
+        WireConfig(state_port=0)
+
+
+def test_it_can_be_started_again_and_twice(server: WireServer) -> None:
+    server.start()
+    server.stop()
+    server.stop()
+    assert not server.alive
+    server.start()
+    with Client(server.config) as client:
+        assert len(client.exchange(encode_command(Fsm.INVALID))) == 208
+
+
+def test_the_world_moves_while_nobody_speaks() -> None:
+    steps: list[int] = []
+    with make_server() as server:
+        server.stop()
+        counting = WireServer(server.twin, server.config, on_step=lambda: steps.append(1))
+        with counting:
+            await_true(lambda: len(steps) > 20)
+    assert server.twin.world.time_s >= 0.002 * 20
+
+
+def test_what_ends_its_thread_is_told_by_stop() -> None:
+    server = make_server()
+    server.twin.world.step = lambda: 1 / 0  # pyright: ignore[reportAttributeAccessIssue] - a world that fails
+    server.start()
+    await_true(lambda: not server.alive)
+    with pytest.raises(ZeroDivisionError):
+        server.stop()
+
+
+# --- The real driver ------------------------------------------------------------------------------------------------
+
+
+def test_two_arms_live_on_two_pairs_of_ports() -> None:
+    with make_server() as one, make_server() as other:
+        arms = [
+            Z1Arm(WallClock(), Z1ArmConfig(command_port=c.command_port, state_port=c.state_port))
+            for c in (one.config, other.config)
+        ]
+        for arm in arms:
+            arm.connect()
+        arms[0].run_label("forward")
+        assert arms[0].read_state().q[:6] == pytest.approx(LABELS["forward"], abs=0.02)
+        assert arms[1].read_state().q[:6] == pytest.approx(z1.Q_HOME, abs=0.05)
+        for arm in arms:
+            arm.disconnect()

@@ -1,0 +1,63 @@
+"""What the twin tells its evaluators, over a real link."""
+
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from hal.backends.mock_arm import MockArm
+from hal.backends.replay_camera import ReplayCamera
+from hal.base.clock import WallClock
+from hal.base.errors import HalTimeoutError
+from hal.bus.server import HalServer
+from hal.bus.session import BusConfig
+from hal.servo.servo import Servo
+from sim_twin.ground_truth import TruthClient, TruthServer, read_truth
+from sim_twin.model.world import World
+
+
+@pytest.fixture
+def bus() -> Iterator[BusConfig]:
+    """A HAL process that knows no truth."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        bus = BusConfig(port=probe.getsockname()[1])
+    clock = WallClock()
+    servo, camera = Servo(MockArm(clock), clock), ReplayCamera(clock=clock)
+    servo.connect()
+    camera.connect()
+    with HalServer(servo, camera, clock, bus):
+        yield bus
+    camera.disconnect()
+    servo.disconnect()
+
+
+def test_the_truth_crosses_the_link_unchanged(bus: BusConfig, world: World) -> None:
+    server, here = TruthServer(bus, world), read_truth(world)
+    with TruthClient(bus) as client:
+        there = client.truth()
+    server.close()
+    assert there.object == "bottle"
+    assert there.lifted_m == here.lifted_m
+    np.testing.assert_array_equal(there.T_base_object, here.T_base_object)
+    np.testing.assert_array_equal(there.qpos, here.qpos)
+
+
+def test_a_robot_that_is_no_twin_is_a_clear_error(bus: BusConfig, world: World) -> None:
+    TruthServer(bus, world).close()
+    with TruthClient(bus) as client, pytest.raises(HalTimeoutError, match="only a simulated HAL knows the truth"):
+        client.truth()
+
+
+def test_a_program_that_forgets_to_close_its_server_still_ends(bus: BusConfig) -> None:
+    program = (
+        "from hal.bus.session import BusConfig; from sim_twin.model.scene import SceneConfig; "
+        "from sim_twin.ground_truth import TruthClient, TruthServer; from sim_twin.model.world import World; "
+        f"bus = BusConfig(port={bus.port}); server = TruthServer(bus, World(SceneConfig())); "
+        "client = TruthClient(bus); print(client.truth().object)"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout.strip() == "bottle"

@@ -1,0 +1,65 @@
+"""A disk that fills up under a recording costs the recording alone, and says so."""
+
+from __future__ import annotations
+
+import resource
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hal.base.messages import Intrinsics, RgbdFrame
+from tests.support.faults_table import FaultsTable
+from z1_runtime.visualization.rerun_logger import Inspector
+
+K = Intrinsics(width=320, height=240, fx=300.0, fy=300.0, cx=159.5, cy=119.5)
+ROOM = 2**20
+
+
+@pytest.fixture
+def little_room() -> Iterator[None]:
+    """No file of this process gets longer than 1 MB, which to its writer is a full disk."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (ROOM, before[1]))
+    yield
+    resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def noisy_frame(n: int) -> RgbdFrame:
+    rng = np.random.default_rng(n)
+    return RgbdFrame(
+        colour=rng.integers(0, 255, (K.height, K.width, 3), dtype=np.uint8),
+        depth_m=rng.uniform(0.1, 1.0, (K.height, K.width)).astype(np.float32),
+        intrinsics=K,
+        stamp_s=0.5 * n,
+        sequence=n,
+    )
+
+
+@pytest.mark.faults
+@pytest.mark.usefixtures("little_room")
+def test_a_disk_that_fills_up_ends_the_recording_and_not_the_pick(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, faults_table: FaultsTable
+) -> None:
+    out = tmp_path / "episode.rrd"
+    inspector = Inspector(out, max_frames=100)
+    frames = 20
+    for n in range(frames):
+        inspector.log_frame(noisy_frame(n), np.eye(4))
+    inspector.close()
+    assert out.stat().st_size <= ROOM
+    assert "the recording may lack its end" in caplog.text
+    faults_table.add(
+        "disk full while recording",
+        arm=f"goes on: {frames} frames were taken, {out.stat().st_size >> 10} KiB of them kept",
+        reads=caplog.records[-1].getMessage(),
+    )
+
+
+@pytest.mark.faults
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="Linux has a disk that is always full")
+def test_a_disk_that_is_full_at_the_start_is_one_clear_error(faults_table: FaultsTable) -> None:
+    with pytest.raises(OSError, match=r"/dev/full cannot be written.*No space left on device") as caught:
+        Inspector(Path("/dev/full"))
+    faults_table.add("disk full before recording", arm="is not touched", reads=caught.value)

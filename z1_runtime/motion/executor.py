@@ -1,0 +1,150 @@
+"""Streams planned motions to the servo, a fifth of a second ahead, and notices when one does not arrive."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from hal.base import z1
+from hal.base.arm import ServoedArm
+from hal.base.clock import Clock
+from hal.base.errors import InvalidValueError, Z1Error
+from hal.base.messages import ArmState, ServoStatus, TrajectoryChunk
+from z1_runtime.types import JointTrajectory
+
+
+class MotionError(Z1Error, RuntimeError):
+    """A motion was begun and not finished; the arm has braked and holds."""
+
+    default_code = "motion"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ExecutorConfig:
+    """How trajectories are handed over."""
+
+    lead_s: float = 0.2
+    """How much motion waits at the servo [s]; a dead runtime moves the arm no longer than this."""
+    chunk_s: float = 0.1
+    """Length of one message [s]."""
+    poll_s: float = 0.02
+    """How often the servo is asked how far it is [s]."""
+    stall_timeout_s: float = 1.0
+    """How long the servo may play nothing of a motion before it counts as lost [s]."""
+    settle_dq: float = 0.02
+    """Joint speed that counts as rest [rad/s]."""
+    settle_timeout_s: float = 3.0
+    """How long a motion may take to come to rest after its end [s]."""
+
+    def __post_init__(self) -> None:
+        if not 0 < self.poll_s < self.chunk_s < self.lead_s:
+            raise InvalidValueError(
+                f"ExecutorConfig needs 0 < poll_s < chunk_s < lead_s; got {self.poll_s}, {self.chunk_s}, {self.lead_s}."
+            )
+        for name in ("stall_timeout_s", "settle_dq", "settle_timeout_s"):
+            if not 0 < getattr(self, name) < np.inf:
+                raise InvalidValueError(f"{name} is {getattr(self, name)}; it must be positive and finite.")
+
+
+Watcher = Callable[[ArmState, ServoStatus], None]
+
+
+class Executor:
+    """Plays trajectories on a `ServoedArm` whose lease is held."""
+
+    def __init__(self, arm: ServoedArm, clock: Clock, config: ExecutorConfig | None = None) -> None:
+        self._arm = arm
+        self._clock = clock
+        self._config = config or ExecutorConfig()
+        self.watchers: list[Watcher] = []
+        """Called with the arm's state every poll, for logs; must return at once."""
+
+    def execute(self, trajectory: JointTrajectory) -> None:
+        """Play `trajectory` to its end; return when the servo has sent its last point.
+
+        Raises:
+            InvalidMessageError: the trajectory holds values that are not finite; nothing moves.
+            CommandRejectedError: the servo will not take it (stopped, wrong start, limits, lease).
+            MotionError: it was dropped on the way, with the servo's reason, or the servo plays it no longer.
+        """
+        trajectory_id = self._arm.status().trajectory_id + 1
+        chunks = _chunks(trajectory, trajectory_id, self._config.chunk_s)
+        sent_s, played_s = 0.0, 0.0
+        moved_s = self._clock.now_s()
+        while True:
+            status = self._look()
+            ours = status.trajectory_id == trajectory_id
+            if ours and status.finished:
+                return
+            if ours and status.reason:
+                raise MotionError(
+                    f"the motion was dropped {status.trajectory_time_s:.2f} s into {trajectory.duration_s:.2f} s: "
+                    f"{status.reason}; the arm holds."
+                )
+            if ours and status.trajectory_time_s > played_s:
+                played_s, moved_s = status.trajectory_time_s, self._clock.now_s()
+            elif self._clock.now_s() - moved_s > self._config.stall_timeout_s:
+                raise MotionError(_stalled(status, trajectory_id, played_s))
+            while chunks and sent_s - played_s < self._config.lead_s:
+                chunk = chunks.popleft()
+                self._arm.stream(chunk)
+                sent_s = float(chunk.t_s[-1])
+            self._clock.sleep_until(self._clock.now_s() + self._config.poll_s)
+
+    def settle(self) -> ArmState:
+        """Wait until no joint moves; return that state.
+
+        Raises:
+            MotionError: it does not come to rest in time.
+        """
+        deadline_s = self._clock.now_s() + self._config.settle_timeout_s
+        quiet = 0
+        while True:
+            self._clock.sleep_until(self._clock.now_s() + self._config.poll_s)
+            self._look()
+            state = self._arm.read_state()
+            quiet = quiet + 1 if np.abs(state.dq).max() < self._config.settle_dq else 0
+            if quiet >= 3:
+                return state
+            if self._clock.now_s() > deadline_s:
+                joint = int(np.abs(state.dq).argmax())
+                raise MotionError(
+                    f"{z1.JOINT_NAMES[joint]} still moves at {state.dq[joint]:.3f} rad/s, "
+                    f"{self._config.settle_timeout_s} s after the motion; rest is {self._config.settle_dq} rad/s."
+                )
+
+    def _look(self) -> ServoStatus:
+        status = self._arm.status()
+        if self.watchers:
+            state = self._arm.read_state()
+            for watch in self.watchers:
+                watch(state, status)
+        return status
+
+
+def _chunks(trajectory: JointTrajectory, trajectory_id: int, length_s: float) -> deque[TrajectoryChunk]:
+    """Return all of `trajectory`, checked before any of it moves the arm."""
+    n = len(trajectory.t_s)
+    return deque(
+        TrajectoryChunk(
+            trajectory_id=trajectory_id,
+            t_s=trajectory.t_s[piece],
+            q=trajectory.q[piece],
+            dq=trajectory.dq[piece],
+            final=piece.stop == n,
+        )
+        for piece in trajectory.pieces(length_s)
+    )
+
+
+def _stalled(status: ServoStatus, trajectory_id: int, played_s: float) -> str:
+    where = f"after {played_s:.2f} s of it" if played_s > 0.0 else "before its start"
+    now = f"the servo is {status.mode.value}, at trajectory {status.trajectory_id}"
+    reason = f" ({status.reason})" if status.reason else ""
+    return (
+        f"motion {trajectory_id} stands still {where}: {now}{reason}. "
+        "The HAL was restarted, its ticks have ended, or another has taken the arm; see its log."
+    )

@@ -1,0 +1,75 @@
+"""Where the camera sits on the flange: from a calibration of this very camera, or else from the mount's drawing."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from calibration.errors import CalibrationError
+from calibration.results import Calibration, load_newest, load_result
+from hal.base import z1
+from hal.base.errors import ConfigError
+
+FOLDER_VARIABLE = "Z1_CALIBRATIONS"
+"""Environment variable with the folder of the results."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Mount:
+    """The hand-eye transform in force and where it is from."""
+
+    T_flange_camera: np.ndarray
+    """(4, 4)."""
+    origin: str
+    """One line for the operator: which file, of when, how good; or why the drawing's figures are taken."""
+
+
+def results_folder(given: Path | None = None) -> Path:
+    """Return where results are kept: `given`, else $Z1_CALIBRATIONS, else z1-grasp/calibrations of the user's data."""
+    if given is not None:
+        return given
+    if named := os.environ.get(FOLDER_VARIABLE):
+        return Path(named)
+    data = os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share"
+    return Path(data) / "z1-grasp" / "calibrations"
+
+
+def find_mount(serial: str, file: Path | None = None, folder: Path | None = None) -> Mount:
+    """Return the mount of the camera `serial`; whatever is doubtful about it is logged as a warning.
+
+    Args:
+        serial: of the camera; empty where it tells none, which then has no calibration of its own.
+        file: the result to use; None takes the newest valid one of this camera, or the drawing where there is none.
+        folder: where results are, as in `results_folder`.
+
+    Raises:
+        ConfigError: `file` is missing or damaged, of another camera, or no hand-eye result of a wrist camera.
+    """
+    folder = results_folder(folder)
+    try:
+        found = load_result(file, serial=serial) if file is not None else load_newest(folder, "hand_eye", serial)
+        T_flange_camera = found.T_flange_camera
+    except CalibrationError as error:
+        if file is None and error.code == "missing_result":
+            return _nominal(serial, folder)
+        raise ConfigError(str(error)) from error
+    return Mount(T_flange_camera=T_flange_camera, origin=_origin(found))
+
+
+def _nominal(serial: str, folder: Path) -> Mount:
+    whose = f"of camera {serial}" if serial else "of this camera, which tells no serial number,"
+    return Mount(
+        T_flange_camera=z1.T_FLANGE_CAMERA,
+        origin=f"the mount's drawing (no hand-eye calibration {whose} in {folder})",
+    )
+
+
+def _origin(found: Calibration) -> str:
+    errors = found.errors
+    return (
+        f"{found.path}, camera {found.serial}, {found.date}, "
+        f"±{errors['uncertainty_mm']:.2f} mm ±{errors['uncertainty_deg']:.3f}°"
+    )

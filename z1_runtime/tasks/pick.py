@@ -1,0 +1,175 @@
+"""One pick: look from home, decide, approach, close, lift, hold."""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+
+from hal.base import z1
+from hal.base.arm import ServoedArm
+from hal.base.camera import Camera
+from hal.base.clock import Clock
+from hal.base.messages import ArmState
+from models.obb.obb import DegenerateCloudError
+from z1_runtime.config import RuntimeConfig
+from z1_runtime.motion.executor import Executor
+from z1_runtime.motion.trajectory import MotionLimits, hold, joint_move
+from z1_runtime.perception.point_cloud import PerceptionError
+from z1_runtime.planning.planner import NoPlanError
+from z1_runtime.tasks.grasp_selection import Decider, Decision
+from z1_runtime.types import GraspPlan
+from z1_runtime.visualization.rerun_logger import Inspector
+
+_LOG = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Phase:
+    """A named part of a pick, on the robot's clock."""
+
+    name: str
+    start_s: float
+    duration_s: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PickRecord:
+    """What happened, for reports."""
+
+    decision: Decision
+    phases: tuple[Phase, ...]
+    held: bool
+    """The jaws still hold something after the lift, by the gripper's own angle and torque."""
+    jaw: float
+    """Mover angle after the lift [rad]; 0 is closed on nothing."""
+    jaw_torque_nm: float
+    """Gripper torque after the lift [Nm]."""
+
+    @property
+    def rejections(self) -> dict[str, int]:
+        """Candidates refused before the executed one, by reason."""
+        return dict(Counter(rejection.reason for rejection in self.decision.plan.rejections))
+
+
+class PickPipeline:
+    """Does picks with connected devices whose lease is held.
+
+    Args:
+        decider: turns a frame into a plan.
+        arm: the servoed arm.
+        camera: the wrist camera.
+        clock: the one both live by.
+        inspector: where everything is shown.
+        config: how a pick is done.
+        on_phase: called with each phase that ended well.
+    """
+
+    def __init__(
+        self,
+        *,
+        decider: Decider,
+        arm: ServoedArm,
+        camera: Camera,
+        clock: Clock,
+        inspector: Inspector,
+        config: RuntimeConfig,
+        on_phase: Callable[[Phase], None] = lambda _: None,
+    ) -> None:
+        self.decider = decider
+        self.arm = arm
+        self.camera = camera
+        self.clock = clock
+        self.inspector = inspector
+        self.config = config
+        self.on_phase = on_phase
+        self.executor = Executor(arm, clock, config.executor)
+        self.executor.watchers.append(inspector.log_arm)
+        self._motion = MotionLimits.at_speed(config.speed)
+        self._phases: list[Phase] = []
+
+    def pick(self) -> PickRecord:
+        """Look, decide, and execute the grasp.
+
+        Raises:
+            As `Decider.decide`; and `MotionError`, `HalError` when the arm does not follow.
+        """
+        self._phases.clear()
+        with self._phase("home"):
+            self._go_home()
+        with self._phase("look"):
+            state = self.executor.settle()
+            frame = self.camera.wait_for_frame(self.config.frame_timeout_s)
+        with self._phase("decide"):
+            decision = self.decider.decide(frame, state.q)
+        self._show(decision)
+        state = self._execute(decision.plan)
+        jaw, torque = float(state.q[-1]), float(state.tau[-1])
+        return PickRecord(
+            decision=decision,
+            phases=tuple(self._phases),
+            held=jaw < self.config.jaw_empty and abs(torque) > self.config.held_torque_nm,
+            jaw=jaw,
+            jaw_torque_nm=torque,
+        )
+
+    def pick_until_held(self) -> PickRecord:
+        """Pick, and while the jaws hold nothing pick again from the scene as it then is, `attempts` times in all.
+
+        Returns the last pick that was executed: what a miss has pushed out of view or out of reach ends it too.
+
+        Raises:
+            As `pick`, for the first attempt; later ones only what the arm or the HAL say.
+        """
+        record = self.pick()
+        for attempt in range(2, self.config.attempts + 1):
+            if record.held:
+                break
+            _LOG.info("the jaws closed on nothing; attempt %d of %d", attempt, self.config.attempts)
+            try:
+                record = self.pick()
+            except (PerceptionError, DegenerateCloudError, NoPlanError) as error:
+                _LOG.warning("no further attempt: %s", error)
+                break
+        return record
+
+    def _go_home(self) -> None:
+        q = np.clip(self.arm.status().q_command, z1.Q_MIN, z1.Q_MAX)
+        q_home = np.append(z1.Q_HOME, self.config.jaw_home)
+        if np.abs(q - q_home).max() > 1e-3:
+            self.executor.execute(joint_move(q, q_home, self._motion))
+
+    def _execute(self, plan: GraspPlan) -> ArmState:
+        motions = {"transfer": plan.transfer, "approach": plan.approach, "close": plan.close, "lift": plan.lift}
+        for name, motion in motions.items():
+            with self._phase(name):
+                self.executor.execute(motion)
+                self.executor.settle()
+        with self._phase("hold"):
+            self.executor.execute(hold(plan.lift.q[-1], self.config.hold_s))
+        return self.arm.read_state()
+
+    def _show(self, decision: Decision) -> None:
+        observation, ranked = decision.observation, decision.ranked
+        self.inspector.log_observation(observation)
+        self.inspector.log_box(ranked.box, ranked.faces, observation.T_base_camera)
+        self.inspector.log_candidates(ranked.grasps, observation.T_base_camera)
+        self.inspector.log_plan(decision.plan)
+        self.inspector.log_stage_times(decision.stage_ms)
+
+    @contextmanager
+    def _phase(self, name: str) -> Iterator[None]:
+        start_s = self.clock.now_s()
+        self.inspector.log_phase(name, start_s)
+        try:
+            yield
+        except Exception:
+            self.inspector.log_phase(f"{name} failed", self.clock.now_s())
+            raise
+        phase = Phase(name=name, start_s=start_s, duration_s=self.clock.now_s() - start_s)
+        self._phases.append(phase)
+        self.on_phase(phase)
