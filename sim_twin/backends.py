@@ -198,7 +198,7 @@ class TwinCamera:
             stamp_s=stamp_s,
             sequence=self._sequence,
             serial=self.world.config.camera_serial(),
-            truth_mask=view.mask,
+            ground_truth_mask=view.mask,
         )
 
     def _expose(self, sequence: int) -> View:

@@ -11,7 +11,7 @@ import numpy as np
 
 from hal.base.clock import WallClock
 from hal.base.errors import HalTimeoutError
-from hal.bus.link import Link
+from hal.bus.link import BusLink
 from hal.bus.service import Service
 from hal.bus.session import BusConfig, open_session
 
@@ -23,7 +23,7 @@ _POSES = ("T_base_object", "T_flange_camera", "T_base_board")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Truth:
+class GroundTruth:
     """The scene as it really is."""
 
     object: str
@@ -40,9 +40,9 @@ class Truth:
     """(14,) MuJoCo's positions: joints [rad], then the object's position [m] and quaternion (wxyz)."""
 
 
-def read_truth(world: SceneView) -> Truth:
+def read_ground_truth(world: SceneView) -> GroundTruth:
     """Return the truth about `world` at this moment."""
-    return Truth(
+    return GroundTruth(
         object=world.config.object,
         T_base_object=world.T_base_object(),
         lifted_m=world.lifted_m(),
@@ -52,7 +52,7 @@ def read_truth(world: SceneView) -> Truth:
     )
 
 
-class TruthServer:
+class GroundTruthServer:
     """Answers questions about a world, beside its HAL process, whose link must be open.
 
     Pictures are left to the asker: drawing one here would take the interpreter from the servo.
@@ -71,7 +71,7 @@ class TruthServer:
         self._session.close()
 
     def _answer(self, asker: str, payload: bytes) -> bytes:
-        truth = read_truth(self._world)
+        truth = read_ground_truth(self._world)
         content = {
             "object": truth.object,
             "lifted_m": truth.lifted_m,
@@ -81,7 +81,7 @@ class TruthServer:
         return msgpack.packb(content)  # pyright: ignore[reportReturnType] (its stub is wrong)
 
 
-class TruthClient:
+class GroundTruthClient:
     """Asks a twin's HAL process.
 
     Raises:
@@ -89,9 +89,9 @@ class TruthClient:
     """
 
     def __init__(self, config: BusConfig) -> None:
-        self._link = Link(replace(config, request_timeout_s=2.0), WallClock(), "the twin's truth")
+        self._link = BusLink(replace(config, request_timeout_s=2.0), WallClock(), "the twin's truth")
 
-    def truth(self) -> Truth:
+    def truth(self) -> GroundTruth:
         """Return the truth at this moment.
 
         Raises:
@@ -105,7 +105,7 @@ class TruthClient:
             ) from error
         for name in _POSES:
             content[name] = None if content[name] is None else np.array(content[name]).reshape(4, 4)
-        return Truth(qpos=np.array(content.pop("qpos")), **content)
+        return GroundTruth(qpos=np.array(content.pop("qpos")), **content)
 
     def close(self) -> None:
         """Hang up."""

@@ -15,10 +15,10 @@ from z1_runtime.motion.trajectory import MotionLimits
 from z1_runtime.perception.detectors import make_detector
 from z1_runtime.perception.segmentation import Perception
 from z1_runtime.planning.planner import GraspPlanner
-from z1_runtime.tasks.grasp_selection import Decider
+from z1_runtime.tasks.grasp_selection import GraspSelector
 
 
-def make_decider(config: RuntimeConfig, T_flange_camera: np.ndarray = z1.T_FLANGE_CAMERA) -> Decider:
+def make_grasp_selector(config: RuntimeConfig, T_flange_camera: np.ndarray = z1.T_FLANGE_CAMERA) -> GraspSelector:
     """Return the decider that `config` describes.
 
     Args:
@@ -32,7 +32,7 @@ def make_decider(config: RuntimeConfig, T_flange_camera: np.ndarray = z1.T_FLANG
     detector = make_detector(config.detector, _yolo_config(config))
     if config.object_class and detector.classes:
         labels_for(config.object_class, detector.classes)  # better refused now than before the object
-    return Decider(
+    return GraspSelector(
         kinematics=kinematics,
         perception=Perception(config.perception, detector, T_flange_camera),
         generator=make_generator(config.generator, _generator_options(config)),

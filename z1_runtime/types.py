@@ -43,7 +43,7 @@ class Observation:
     scene_points: np.ndarray
     """(M, 3) everything else that was seen: the table, neighbours, walls; not the object."""
     table: Plane
-    hidden_points: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
+    occluded_points: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
     """(K, 3) where the object may go on, but its sight was blocked; see `z1_runtime.perception.occlusion`."""
 
 

@@ -9,9 +9,9 @@ from scipy.stats import f as f_distribution
 
 from calibration.hand_eye.closed_forms import robust_start
 from calibration.hand_eye.pose_fit import (
-    Fit,
     NoiseLevels,
     PoseData,
+    PoseFit,
     covariances,
     errors,
     estimate_noise,
@@ -33,7 +33,7 @@ _LEAST_MOVE_MM, _LEAST_MOVE_DEG = 1.0, 0.3
 class Belief:
     """A fit to the samples that agree."""
 
-    fit: Fit
+    fit: PoseFit
     """The unknowns, from the samples kept."""
     noise: NoiseLevels
     """Scatter of the arm."""
@@ -53,15 +53,15 @@ class Move:
     """How far it turned [°]."""
 
 
-def start_fit(data: PoseData) -> Fit:
+def start_fit(data: PoseData) -> PoseFit:
     """Return a fit of most samples to start from."""
     T_mount_camera, T_anchor_board, _ = robust_start(data.Ts_anchor_mount, data.Ts_camera_board)
-    return Fit(
+    return PoseFit(
         T_mount_camera=T_mount_camera, Ts_anchor_board=T_anchor_board[None], place=np.zeros(len(data), dtype=int)
     )
 
 
-def robust_solve(data: PoseData, fit: Fit, noise: NoiseLevels, *, rounds: int = 15) -> tuple[Fit, np.ndarray]:
+def robust_solve(data: PoseData, fit: PoseFit, noise: NoiseLevels, *, rounds: int = 15) -> tuple[PoseFit, np.ndarray]:
     """Return the fit to the samples that agree (Tukey's weights, free scale), and the squared distances (N,) of all."""
     swallowed = 6 * len(data) / (6 * len(data) - 6 - 6 * len(fit.Ts_anchor_board))
     for _ in range(rounds):
@@ -75,7 +75,7 @@ def robust_solve(data: PoseData, fit: Fit, noise: NoiseLevels, *, rounds: int = 
     return fit, squared_distances(errors(data, fit), covariances(data, fit, noise))
 
 
-def believe(data: PoseData, fit: Fit, *, free_scale: bool = True) -> Belief:
+def believe(data: PoseData, fit: PoseFit, *, free_scale: bool = True) -> Belief:
     """Return the fit to all samples that agree with each other.
 
     A sample is judged by the solution of all others, so that a bad one cannot vouch for itself; one dropped in an
@@ -98,7 +98,7 @@ def believe(data: PoseData, fit: Fit, *, free_scale: bool = True) -> Belief:
     return Belief(fit=fit, noise=noise, kept=kept)
 
 
-def find_move(data: PoseData, fit: Fit) -> Move | None:
+def find_move(data: PoseData, fit: PoseFit) -> Move | None:
     """Return where in the sequence the board was moved, if it was."""
     noise = NoiseLevels()
     gain, best, index = _best_split(data, fit, noise)
@@ -116,7 +116,7 @@ def find_move(data: PoseData, fit: Fit) -> Move | None:
     return Move(first=index, mm=float(mm), deg=float(deg))
 
 
-def _best_split(data: PoseData, fit: Fit, noise: NoiseLevels) -> tuple[float, Fit | None, int]:
+def _best_split(data: PoseData, fit: PoseFit, noise: NoiseLevels) -> tuple[float, PoseFit | None, int]:
     """Return how much better two places explain the samples, with the fit and the first sample of the second."""
     _, d2 = robust_solve(data, fit, noise)
     one = np.minimum(d2, _FAR).sum()

@@ -36,7 +36,7 @@ class PoseData:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Fit:
+class PoseFit:
     """The unknowns."""
 
     T_mount_camera: np.ndarray
@@ -57,19 +57,19 @@ class NoiseLevels:
     arm_rad: float = 1e-3
 
 
-def predict(data: PoseData, fit: Fit) -> np.ndarray:
+def predict(data: PoseData, fit: PoseFit) -> np.ndarray:
     """Return where the arm says the camera sees the board, (N, 4, 4)."""
     return inverse(data.Ts_anchor_mount @ fit.T_mount_camera) @ fit.Ts_anchor_board[fit.place]
 
 
-def errors(data: PoseData, fit: Fit) -> np.ndarray:
+def errors(data: PoseData, fit: PoseFit) -> np.ndarray:
     """Return e (N, 6): position [m] and rotation vector [rad] in camera axes."""
     predicted, seen = predict(data, fit), data.Ts_camera_board
     turned = predicted[:, :3, :3] @ np.swapaxes(seen[:, :3, :3], 1, 2)
     return np.hstack([predicted[:, :3, 3] - fit.scale * seen[:, :3, 3], rotation_vectors(turned)])
 
 
-def slopes(data: PoseData, fit: Fit) -> np.ndarray:
+def slopes(data: PoseData, fit: PoseFit) -> np.ndarray:
     """Return the derivatives (N, 6, 7 + 6 G) of e by the scale, the camera's ξ, and the ξ of each place."""
     predicted = predict(data, fit)
     n, n_places = len(data), len(fit.Ts_anchor_board)
@@ -83,7 +83,7 @@ def slopes(data: PoseData, fit: Fit) -> np.ndarray:
     return J
 
 
-def arm_slopes(data: PoseData, fit: Fit) -> np.ndarray:
+def arm_slopes(data: PoseData, fit: PoseFit) -> np.ndarray:
     """Return how a small motion of the flange, in its own axes, changes e: (N, 6, 6), up to the sign."""
     R_camera_mount = fit.T_mount_camera[:3, :3].T
     boards = fit.Ts_anchor_board[fit.place]
@@ -99,7 +99,7 @@ def arm_slopes(data: PoseData, fit: Fit) -> np.ndarray:
     return M
 
 
-def covariances(data: PoseData, fit: Fit, noise: NoiseLevels) -> np.ndarray:
+def covariances(data: PoseData, fit: PoseFit, noise: NoiseLevels) -> np.ndarray:
     """Return the covariance (N, 6, 6) of each sample's e."""
     M = arm_slopes(data, fit)
     arm = np.repeat([noise.arm_m**2, noise.arm_rad**2], 3)
@@ -107,8 +107,8 @@ def covariances(data: PoseData, fit: Fit, noise: NoiseLevels) -> np.ndarray:
 
 
 def solve(
-    data: PoseData, fit: Fit, C: np.ndarray, weights: np.ndarray, *, free_scale: bool, rounds: int = 10
-) -> tuple[Fit, np.ndarray]:
+    data: PoseData, fit: PoseFit, C: np.ndarray, weights: np.ndarray, *, free_scale: bool, rounds: int = 10
+) -> tuple[PoseFit, np.ndarray]:
     """Return the fit nearest to the samples, and the covariance of (scale, camera ξ, board ξ …).
 
     Args:
@@ -141,7 +141,7 @@ def solve(
     return fit, P
 
 
-def _step(e: np.ndarray, J: np.ndarray, W: np.ndarray, fit: Fit, free_scale: bool) -> tuple[np.ndarray, np.ndarray]:
+def _step(e: np.ndarray, J: np.ndarray, W: np.ndarray, fit: PoseFit, free_scale: bool) -> tuple[np.ndarray, np.ndarray]:
     H, g = _normal_equations(e, J, W)
     H[0, 0] += _SCALE_SD**-2
     g[0] += (fit.scale - 1.0) * _SCALE_SD**-2
@@ -162,7 +162,9 @@ def squared_distances(e: np.ndarray, C: np.ndarray) -> np.ndarray:
     return np.einsum("ni,ni->n", e, np.linalg.solve(C, e[..., None])[..., 0])
 
 
-def estimate_noise(data: PoseData, fit: Fit, kept: np.ndarray, start: NoiseLevels, *, free_scale: bool) -> NoiseLevels:
+def estimate_noise(
+    data: PoseData, fit: PoseFit, kept: np.ndarray, start: NoiseLevels, *, free_scale: bool
+) -> NoiseLevels:
     """Return the scatter of the arm that makes the errors of the samples `kept` (N,) bool most likely.
 
     Restricted maximum likelihood: that the fit has swallowed part of the errors is reckoned with.
@@ -191,7 +193,7 @@ def estimate_noise(data: PoseData, fit: Fit, kept: np.ndarray, start: NoiseLevel
 
 
 def leave_one_out(
-    data: PoseData, fit: Fit, C: np.ndarray, kept: np.ndarray, *, free_scale: bool
+    data: PoseData, fit: PoseFit, C: np.ndarray, kept: np.ndarray, *, free_scale: bool
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return each sample's error (N, 6) under the solution of all other samples kept, and its covariance (N, 6, 6)."""
     e, J, W = errors(data, fit), slopes(data, fit), np.linalg.inv(C)

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from calibration.board.board import Board
 from calibration.board.detection import BoardView
 from calibration.camera_model import CameraModel
-from calibration.hand_eye.pose_fit import Fit, NoiseLevels, PoseData
+from calibration.hand_eye.pose_fit import NoiseLevels, PoseData, PoseFit
 from calibration.transforms import inverse, moved, skew
 
 _HUBER = 2.5  # standard deviations from which a corner counts less than its square
@@ -69,8 +69,8 @@ def reprojection_px(refine: Refinement, predicted: np.ndarray, scale: float) -> 
 
 
 def refine_jointly(
-    refine: Refinement, data: PoseData, fit: Fit, noise: NoiseLevels, kept: np.ndarray
-) -> tuple[Fit, np.ndarray]:
+    refine: Refinement, data: PoseData, fit: PoseFit, noise: NoiseLevels, kept: np.ndarray
+) -> tuple[PoseFit, np.ndarray]:
     """Return the refined fit and the covariance (6, 6) of the camera's ξ; the scale stays what it is."""
     bundle = _Bundle(refine, data, fit, noise, np.flatnonzero(kept))
     for _ in range(_ROUNDS):
@@ -92,7 +92,9 @@ def refine_jointly(
 class _Bundle:
     """All corners of all samples kept, as scipy wants them: parameters are camera ξ, board ξ, η of each sample."""
 
-    def __init__(self, refine: Refinement, data: PoseData, fit: Fit, noise: NoiseLevels, samples: np.ndarray) -> None:
+    def __init__(
+        self, refine: Refinement, data: PoseData, fit: PoseFit, noise: NoiseLevels, samples: np.ndarray
+    ) -> None:
         self.fit = fit
         self.samples = samples
         self.sizes = np.concatenate([np.repeat([1e-3, 1e-3] * 2, 3), np.tile(np.repeat([1e-4, 1e-4], 3), len(samples))])
@@ -103,7 +105,7 @@ class _Bundle:
         self._views = [refine.views[i] for i in samples]
         self._points = [fit.scale * refine.board.corners_m[view.ids] for view in self._views]
 
-    def moved_fit(self, x: np.ndarray) -> Fit:
+    def moved_fit(self, x: np.ndarray) -> PoseFit:
         """Return the fit changed by the first twelve parameters."""
         boards = np.stack([moved(T, x[6:12]) for T in self.fit.Ts_anchor_board])
         return replace(self.fit, T_mount_camera=moved(self.fit.T_mount_camera, x[:6]), Ts_anchor_board=boards)

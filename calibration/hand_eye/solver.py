@@ -18,7 +18,7 @@ from calibration.errors import CalibrationError, CalibrationWarning
 from calibration.hand_eye.closed_forms import all_closed_forms
 from calibration.hand_eye.consistency import Belief, Move, believe, explain_order, find_move, start_fit
 from calibration.hand_eye.diversity import MIN_POSES, check_diversity, diversity
-from calibration.hand_eye.pose_fit import Fit, PoseData, covariances, errors, leave_one_out, predict, solve
+from calibration.hand_eye.pose_fit import PoseData, PoseFit, covariances, errors, leave_one_out, predict, solve
 from calibration.hand_eye.refinement import Refinement, corner_covariances, refine_jointly, reprojection_px
 from calibration.hand_eye.result import HandEyeResult, MethodResult, Setup
 from calibration.hand_eye.uncertainty import radius
@@ -186,7 +186,7 @@ def _settle_scale(data: PoseData, belief: Belief, refine: Refinement | None) -> 
     return belief, [CalibrationWarning(code="wrong_square_size", message=message)]
 
 
-def _outliers(data: PoseData, fit: Fit, bad: np.ndarray, names: tuple[str, ...]) -> dict[str, str]:
+def _outliers(data: PoseData, fit: PoseFit, bad: np.ndarray, names: tuple[str, ...]) -> dict[str, str]:
     mm, deg = _sizes(errors(data, fit))
     return {
         names[i]: f"sees the board {mm[i]:.1f} mm and {deg[i]:.2f}° from where the others do"
@@ -219,7 +219,9 @@ def _methods(data: PoseData, kept: np.ndarray, scale: float) -> tuple[MethodResu
     arm, found = data.Ts_anchor_mount[kept], []
     for name, T_mount_camera in all_closed_forms(arm, seen):
         T_anchor_board = _mean_pose(arm @ T_mount_camera @ seen)
-        fit = Fit(T_mount_camera=T_mount_camera, Ts_anchor_board=T_anchor_board[None], place=np.zeros(len(data), int))
+        fit = PoseFit(
+            T_mount_camera=T_mount_camera, Ts_anchor_board=T_anchor_board[None], place=np.zeros(len(data), int)
+        )
         mm, deg = _sizes(errors(data, replace(fit, scale=scale))[kept])
         found.append(
             MethodResult(

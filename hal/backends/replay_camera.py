@@ -107,9 +107,9 @@ def save_frames(path: str | Path, frames: Sequence[RgbdFrame]) -> None:
         "sequence": np.array([frame.sequence for frame in frames]),
         "serial": np.array(frames[0].serial),
     }
-    masks = [frame.truth_mask for frame in frames]
+    masks = [frame.ground_truth_mask for frame in frames]
     if all(mask is not None for mask in masks):
-        arrays["truth_mask"] = np.stack([np.asarray(mask) for mask in masks])
+        arrays["ground_truth_mask"] = np.stack([np.asarray(mask) for mask in masks])
     arrays |= {f"intrinsics_{name}": np.array(value) for name, value in asdict(frames[0].intrinsics).items()}
     with Path(path).open("wb") as file:
         np.savez_compressed(file, allow_pickle=False, **arrays)
@@ -134,7 +134,7 @@ def load_frames(path: str | Path) -> list[RgbdFrame]:
             height=int(arrays["intrinsics_height"]),
             **{name: float(arrays[f"intrinsics_{name}"]) for name in ("fx", "fy", "cx", "cy")},
         )
-        masks = arrays.get("truth_mask")
+        masks = arrays.get("ground_truth_mask")
         serial = str(arrays.get("serial", ""))  # recordings of before it was known
         return [
             RgbdFrame(
@@ -144,7 +144,7 @@ def load_frames(path: str | Path) -> list[RgbdFrame]:
                 stamp_s=float(arrays["stamp_s"][i]),
                 sequence=int(arrays["sequence"][i]),
                 serial=serial,
-                truth_mask=None if masks is None else masks[i],
+                ground_truth_mask=None if masks is None else masks[i],
             )
             for i, colour in enumerate(arrays["colour"])
         ]

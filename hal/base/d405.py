@@ -50,7 +50,7 @@ def rates_hz(width: int, height: int) -> tuple[int, ...]:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Calibration:
+class D405Calibration:
     """One unit's optics, as figures of its full sensor, 1280 pixels wide; other resolutions scale and crop it."""
 
     depth_focal_px: float = 641.52
@@ -105,7 +105,7 @@ def _scaled(
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Look:
+class CaptureRequest:
     """What is wanted of one exposure."""
 
     number: int
@@ -129,7 +129,7 @@ class Exposure:
     """What the optics saw at one instant; an image that is None is not delivered."""
 
     number: int
-    """That of the `Look`; a source that hangs repeats the last."""
+    """That of the `CaptureRequest`; a source that hangs repeats the last."""
     stamp_s: float
     """Mid-exposure, by the source's clock [s]."""
     depth: np.ndarray | None = None
@@ -156,7 +156,7 @@ class FrameSource(Protocol):
         ...
 
     @property
-    def calibration(self) -> Calibration:
+    def calibration(self) -> D405Calibration:
         """Of the optics."""
         ...
 
@@ -165,7 +165,7 @@ class FrameSource(Protocol):
         """False while the cable is out."""
         ...
 
-    def expose(self, look: Look) -> Exposure | None:
+    def expose(self, look: CaptureRequest) -> Exposure | None:
         """Return what is seen now; None = the camera hangs and delivers nothing."""
         ...
 

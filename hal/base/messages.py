@@ -83,14 +83,14 @@ class RgbdFrame:
     """Counts up by one a frame; a gap means lost frames."""
     serial: str = ""
     """Serial number of the camera, by which its calibration is found; empty where it tells none."""
-    truth_mask: np.ndarray | None = None
+    ground_truth_mask: np.ndarray | None = None
     """(H, W) bool, the target object's pixels. Only the twin fills it, for evaluation only."""
 
     def __post_init__(self) -> None:
         size = (self.intrinsics.height, self.intrinsics.width)
         _freeze(self, colour=(np.uint8, (*size, 3)), depth_m=(np.float32, size))
-        if self.truth_mask is not None:
-            _freeze(self, truth_mask=(np.bool_, size))
+        if self.ground_truth_mask is not None:
+            _freeze(self, ground_truth_mask=(np.bool_, size))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -68,8 +68,8 @@ def _hand_points() -> np.ndarray:
     return points
 
 
-HAND_POINTS = _hand_points()
+GRIPPER_POINTS = _hand_points()
 """(18, 3) corners of fixed jaw and camera housing, in the pivot frame [m] (STL meshes, `hal.base.z1`)."""
-MOVER_POINTS = _edges((0.100, -0.009, 0.031), (0.100, 0.008, 0.031), (0.080, 0.020, 0.036), (0.040, 0.026, 0.041))
+MOVING_JAW_POINTS = _edges((0.100, -0.009, 0.031), (0.100, 0.008, 0.031), (0.080, 0.020, 0.036), (0.040, 0.026, 0.041))
 """(8, 3) corners of the moving jaw, in the pivot frame when it is closed [m] (STL mesh)."""
-MOVER_POINTS.setflags(write=False)
+MOVING_JAW_POINTS.setflags(write=False)

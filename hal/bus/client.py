@@ -16,7 +16,7 @@ from hal.base.errors import HalTimeoutError, NotConnectedError
 from hal.base.messages import ArmSetpoint, ArmState, ServoStatus, TrajectoryChunk
 from hal.bus import keys
 from hal.bus.codec import decode, encode
-from hal.bus.link import Link
+from hal.bus.link import BusLink
 from hal.bus.remote_camera import RemoteCamera as RemoteCamera  # noqa: PLC0414 (a re-export)
 from hal.bus.service import Listener, as_bytes
 from hal.bus.session import BusConfig
@@ -41,7 +41,7 @@ class RemoteArm:
         self._suffix = uuid.uuid4().hex[:8]
         self._owner = f"{owner}-{self._suffix}"
         self._clock = clock or WallClock()
-        self._link: Link | None = None
+        self._link: BusLink | None = None
         self._states: Listener | None = None
         self._newest = b""
         self._arrived = threading.Event()
@@ -57,7 +57,7 @@ class RemoteArm:
         """
         if self._link is not None:
             return
-        link = Link(self._config, self._clock, "the remote arm")
+        link = BusLink(self._config, self._clock, "the remote arm")
         self._arrived.clear()
         states = Listener(link.session, keys.STATE, self._take_state)
         if not self._arrived.wait(self._config.connect_timeout_s):
@@ -172,7 +172,7 @@ class RemoteArm:
         state = decode(self._newest, ArmState)
         return state, self._clock.now_s() + link.clock_offset_s - state.stamp_s
 
-    def _connected(self) -> Link:
+    def _connected(self) -> BusLink:
         if self._link is None:
             raise NotConnectedError("the remote arm")
         return self._link

@@ -28,7 +28,7 @@ _MAX_HEADER = 64 * 2**10
 _MAX_TEXT = 2000
 _PREFIX = struct.Struct("<2sBBI")
 _MAGIC = b"Z1"
-_DTYPES = {"colour": np.dtype("|u1"), "depth_m": np.dtype("<f4"), "truth_mask": np.dtype("|b1")}
+_DTYPES = {"colour": np.dtype("|u1"), "depth_m": np.dtype("<f4"), "ground_truth_mask": np.dtype("|b1")}
 _FLOAT = np.dtype("<f8")
 
 

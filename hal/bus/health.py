@@ -9,7 +9,7 @@ from hal.base.errors import HalTimeoutError
 from hal.base.messages import ServoHealth
 from hal.bus import keys
 from hal.bus.codec import decode
-from hal.bus.link import Link
+from hal.bus.link import BusLink
 from hal.bus.service import Listener, as_bytes
 from hal.bus.session import BusConfig
 
@@ -22,7 +22,7 @@ def wait_for_health(config: BusConfig, clock: Clock, timeout_s: float = 3.0) -> 
         InvalidMessageError: what it publishes is none.
     """
     heard: queue.SimpleQueue[bytes] = queue.SimpleQueue()
-    link = Link(config, clock, "the HAL's health")
+    link = BusLink(config, clock, "the HAL's health")
     listener = Listener(link.session, keys.HEALTH, lambda sample: heard.put(as_bytes(sample.payload)))
     try:
         return decode(heard.get(timeout=timeout_s), ServoHealth)

@@ -20,7 +20,7 @@ _SAME_CLOCK_S = 0.05
 """Both ends on one machine read the same clock; what the exchange of stamps seems to differ by is its own delay."""
 
 
-class Link:
+class BusLink:
     """An open connection to a HAL process that has said hello.
 
     Args:

@@ -18,7 +18,7 @@ from hal.base.messages import Intrinsics, RgbdFrame
 from hal.bus import keys
 from hal.bus.codec import decode
 from hal.bus.frames import FrameStamp
-from hal.bus.link import Link
+from hal.bus.link import BusLink
 from hal.bus.service import Listener, as_bytes
 from hal.bus.session import BusConfig
 
@@ -42,7 +42,7 @@ class RemoteCamera:
     def __init__(self, config: BusConfig | None = None, clock: Clock | None = None) -> None:
         self._config = config or BusConfig()
         self._clock = clock or WallClock()
-        self._link: Link | None = None
+        self._link: BusLink | None = None
         self._intrinsics: Intrinsics | None = None
         self._news = threading.Condition()
         # Below, all under `_news`.
@@ -65,7 +65,7 @@ class RemoteCamera:
         if self._link is not None:
             return
         self.lost_frames = 0
-        self._link = Link(self._config, self._clock, "the remote camera")
+        self._link = BusLink(self._config, self._clock, "the remote camera")
         atexit.register(self.disconnect)  # a program that ends carelessly leaves no thread inside Zenoh
         try:
             # The first frame is answered by a camera that may have to wake up.
@@ -139,12 +139,12 @@ class RemoteCamera:
             with self._news:
                 self._waiting -= 1
 
-    def _connected(self) -> Link:
+    def _connected(self) -> BusLink:
         if self._link is None:
             raise NotConnectedError("the remote camera")
         return self._link
 
-    def _wait_newer(self, link: Link, began_s: float, timeout_s: float) -> tuple[FrameStamp, zenoh.ZBytes]:
+    def _wait_newer(self, link: BusLink, began_s: float, timeout_s: float) -> tuple[FrameStamp, zenoh.ZBytes]:
         give_up_s = began_s + timeout_s
         with self._news:
             while True:

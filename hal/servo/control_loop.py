@@ -10,7 +10,7 @@ from hal.base.messages import ArmSetpoint, ArmState, ServoMode
 from hal.base.z1 import N_ARM
 from hal.servo.command_mailbox import Orders, Snapshot
 from hal.servo.limits import OverloadWatch, ServoLimits, clip_setpoint, find_blocked, servo_torque
-from hal.servo.setpoint_generator import Motion, Wish
+from hal.servo.setpoint_generator import SetpointGenerator, Wish
 from hal.servo.trajectory_buffer import Playback
 
 
@@ -38,7 +38,7 @@ class Cycle:
     ) -> None:
         self._arm, self._limits, self._orders = arm, limits, orders
         self._heartbeat_timeout_s, self._send_timeout_s = heartbeat_timeout_s, send_timeout_s
-        self._motion = Motion(limits, state.q)
+        self._motion = SetpointGenerator(limits, state.q)
         self._overload = OverloadWatch(limits)
         self._state, self._q_sent = state, state.q
         self._link_lost = self._give_way = self._gave_way = False

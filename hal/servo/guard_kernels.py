@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from hal.base.z1_shape import CAPSULE_PAIRS, CAPSULES, GRIPPER_OBSTACLES, HAND_POINTS, MOVER_POINTS, TABLE_LINKS
+from hal.base.z1_shape import CAPSULE_PAIRS, CAPSULES, GRIPPER_OBSTACLES, GRIPPER_POINTS, MOVING_JAW_POINTS, TABLE_LINKS
 
 _LINKS = ("link00", "link01", "link02", "link03", "link04", "link05", "link06")
 _LINK = np.array([_LINKS.index(capsule.link) for capsule in CAPSULES])
@@ -103,11 +103,11 @@ def measure_margins(q, joints, lower, upper, T_flange_pivot):
             own[k] = min(own[k], gap - _RADII[one] - _RADII[other])
         _chain(links[6], T_flange_pivot, 1, 0.0, pivot)
         _chain(pivot, unmoved, 1, q[k, 6], mover)
-        for i in range(len(HAND_POINTS) + len(MOVER_POINTS)):
-            if i < len(HAND_POINTS):
-                _apply(pivot, HAND_POINTS[i], point)
+        for i in range(len(GRIPPER_POINTS) + len(MOVING_JAW_POINTS)):
+            if i < len(GRIPPER_POINTS):
+                _apply(pivot, GRIPPER_POINTS[i], point)
             else:
-                _apply(mover, MOVER_POINTS[i - len(HAND_POINTS)], point)
+                _apply(mover, MOVING_JAW_POINTS[i - len(GRIPPER_POINTS)], point)
             table[k] = min(table[k], point[2])
             for a in range(3):
                 box[k] = min(box[k], point[a] - lower[a], upper[a] - point[a])

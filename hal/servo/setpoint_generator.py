@@ -20,7 +20,7 @@ Wish = tuple[np.ndarray, np.ndarray]
 """Positions (7,) [rad] and velocities (7,) [rad/s], before the limits."""
 
 
-class Motion:
+class SetpointGenerator:
     """What the commanded joints do; used by the tick's thread alone. Every call that returns a wish is one tick.
 
     Args:

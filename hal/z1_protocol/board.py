@@ -16,7 +16,7 @@ from hal.z1_protocol.records import (
     JOINT_STATE_OLD,
     JointCommands,
     JointStates,
-    WireError,
+    ProtocolError,
     pack_commands,
     pack_states,
     unpack_commands,
@@ -59,7 +59,7 @@ def decode_self_check(data: bytes | memoryview) -> tuple[int, ...]:
         WireError: not the answer to a self-check.
     """
     if len(data) < 2 or data[0] != _SELF_CHECK_ANSWER or data[1] not in MOTORS or len(data) != 2 + data[1]:
-        raise WireError(
+        raise ProtocolError(
             f"the answer to the self-check is {bytes(data[:12]).hex()} ({len(data)} bytes); allowed is 20, the number "
             f"of motors ({MOTORS[1]} or {MOTORS[0]}) and a byte for each."
         )
@@ -82,7 +82,7 @@ def decode_command(data: bytes | memoryview) -> JointCommands:
         WireError: wrong size, or a value that is not finite.
     """
     if len(data) not in COMMAND_SIZES:
-        raise WireError(f"the board's command has {len(data)} bytes; allowed are {COMMAND_SIZES}.")
+        raise ProtocolError(f"the board's command has {len(data)} bytes; allowed are {COMMAND_SIZES}.")
     return unpack_commands(np.frombuffer(bytes(data), JOINT_CMD))
 
 
@@ -105,4 +105,4 @@ def decode_state(data: bytes | memoryview) -> JointStates:
         return unpack_states(np.frombuffer(bytes(data), JOINT_STATE))
     if len(data) in OLD_STATE_SIZES:
         return unpack_states(np.frombuffer(bytes(data), JOINT_STATE_OLD))
-    raise WireError(f"the board's state has {len(data)} bytes; allowed are {STATE_SIZES + OLD_STATE_SIZES}.")
+    raise ProtocolError(f"the board's state has {len(data)} bytes; allowed are {STATE_SIZES + OLD_STATE_SIZES}.")

@@ -19,7 +19,7 @@ from hal.z1_protocol.records import (
     KP_SCALE,
     JointCommands,
     JointStates,
-    WireError,
+    ProtocolError,
     pack_commands,
     pack_states,
     unpack_commands,
@@ -111,7 +111,7 @@ class Command:
         kind, *numbers, order = _TRAJECTORY.unpack_from(self.body)
         values = np.array(numbers)
         if not np.isfinite(values).all():
-            raise WireError(f"a move holds values that are not finite: {values[~np.isfinite(values)][:3]}.")
+            raise ProtocolError(f"a move holds values that are not finite: {values[~np.isfinite(values)][:3]}.")
         return TrajectoryCommand(
             kind=kind,
             poses=values[:12].reshape(2, 6),
@@ -129,7 +129,7 @@ class Command:
         """
         name = self.body[:_LABEL_SIZE].split(b"\0", 1)[0]
         if not name or not all(0x20 < byte < 0x7F for byte in name):
-            raise WireError(f"a label is {name!r}; allowed are 1 to {_LABEL_SIZE} printable ASCII characters.")
+            raise ProtocolError(f"a label is {name!r}; allowed are 1 to {_LABEL_SIZE} printable ASCII characters.")
         return name.decode("ascii")
 
 
@@ -177,7 +177,7 @@ def encode_command(
         case TrajectoryCommand():
             packed = _pack_trajectory(body)
     if len(packed) > _BODY_SIZE:
-        raise WireError(f"a command holds {len(packed)} bytes beside its head; allowed are {_BODY_SIZE}.")
+        raise ProtocolError(f"a command holds {len(packed)} bytes beside its head; allowed are {_BODY_SIZE}.")
     return _COMMAND_HEAD.pack(_HEAD, state, track) + packed.ljust(_BODY_SIZE, b"\0")
 
 
@@ -191,7 +191,7 @@ def decode_command(data: bytes | memoryview) -> Command:
     head, state, track = _COMMAND_HEAD.unpack_from(data)
     _check_head(head, state)
     if track > 1:
-        raise WireError(f"a command's track flag is {track}; allowed are 0 and 1.")
+        raise ProtocolError(f"a command's track flag is {track}; allowed are 0 and 1.")
     return Command(state=Fsm(state), track=bool(track), body=bytes(data[_COMMAND_HEAD.size :]))
 
 
@@ -202,7 +202,7 @@ def encode_state(state: ControllerState) -> bytes:
         WireError: a value that is not finite, or not seven joints.
     """
     if not np.isfinite(state.pose).all():
-        raise WireError(f"the pose {state.pose} must be finite.")
+        raise ProtocolError(f"the pose {state.pose} must be finite.")
     joints = pack_states(state.joints).tobytes()
     data = _STATE_HEAD.pack(_HEAD, state.state) + joints + _POSE.pack(*state.pose)
     _check_size(data, STATE_SIZE, "a state")
@@ -220,7 +220,7 @@ def decode_state(data: bytes | memoryview) -> ControllerState:
     _check_head(head, state)
     pose = np.array(_POSE.unpack_from(data, _POSE_AT))
     if not (np.abs(pose) <= _PLAUSIBLE_POSE).all():
-        raise WireError(f"the gripper's pose is {pose}; allowed are finite values within ±{_PLAUSIBLE_POSE:g}.")
+        raise ProtocolError(f"the gripper's pose is {pose}; allowed are finite values within ±{_PLAUSIBLE_POSE:g}.")
     records = np.frombuffer(bytes(data[_JOINTS_AT:_POSE_AT]), JOINT_STATE)
     return ControllerState(state=Fsm(state), joints=unpack_states(records), pose=pose)
 
@@ -228,7 +228,7 @@ def decode_state(data: bytes | memoryview) -> ControllerState:
 def _pack_label(label: str) -> bytes:
     packed = label.encode("ascii", "replace")
     if not 1 <= len(packed) <= _LABEL_SIZE or not label.isascii() or not label.isprintable() or " " in label:
-        raise WireError(
+        raise ProtocolError(
             f"the label {label!r} cannot be sent; allowed are 1 to {_LABEL_SIZE} printable ASCII characters."
         )
     return packed
@@ -237,17 +237,17 @@ def _pack_label(label: str) -> bytes:
 def _pack_trajectory(move: TrajectoryCommand) -> bytes:
     numbers = [*np.asarray(move.poses, dtype=float).ravel(), move.gripper_rad, move.max_speed, move.stop_time_s]
     if not np.isfinite(numbers).all():
-        raise WireError(f"a move holds values that are not finite: {numbers}.")
+        raise ProtocolError(f"a move holds values that are not finite: {numbers}.")
     return _TRAJECTORY.pack(move.kind, *numbers, move.order)
 
 
 def _check_size(data: bytes | memoryview, size: int, what: str) -> None:
     if len(data) != size:
-        raise WireError(f"{what} has {len(data)} bytes; allowed are {size}.")
+        raise ProtocolError(f"{what} has {len(data)} bytes; allowed are {size}.")
 
 
 def _check_head(head: bytes, state: int) -> None:
     if head != _HEAD:
-        raise WireError(f"a datagram begins with {head.hex()}; allowed is {_HEAD.hex()}.")
+        raise ProtocolError(f"a datagram begins with {head.hex()}; allowed is {_HEAD.hex()}.")
     if state not in _STATES:
-        raise WireError(f"a datagram names state {state}; allowed are 0 to {max(_STATES)}.")
+        raise ProtocolError(f"a datagram names state {state}; allowed are 0 to {max(_STATES)}.")

@@ -12,7 +12,7 @@ from hal.base.errors import HalError, LeaseError
 _LARGEST = 2048
 
 
-class Link(Protocol):
+class DatagramLink(Protocol):
     """Datagrams to one peer and from it."""
 
     def open(self) -> None:

@@ -1,7 +1,7 @@
 """What both of the Z1's wire protocols are made of: the packed records of a joint, and how they are checked.
 
 Everything is little-endian and unpadded. The sizes were measured on the vendor's own programs; a test asserts them.
-Decoders take whatever a socket delivers: what is not exactly right is a `WireError`, which the loops count and drop.
+Decoders take whatever a socket delivers: anything malformed is a `ProtocolError`, which the loops count and drop.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _FIELDS = ("tau", "dq", "ddq", "q")
 _PLAUSIBLE = np.array([300.0, 100.0, 1e5, 50.0])
 
 
-class WireError(HalError, ValueError):
+class ProtocolError(HalError, ValueError):
     """A datagram that is not what the protocol allows; the message names the field."""
 
 
@@ -101,7 +101,7 @@ def pack_commands(commands: JointCommands) -> np.ndarray:
     """Return records (N,) of `JOINT_CMD`.
 
     Raises:
-        WireError: a value that is not finite as a 32-bit float.
+        ProtocolError: a value that is not finite as a 32-bit float.
     """
     return _pack(commands, JOINT_CMD, JOINT_CMD.names or ())
 
@@ -112,7 +112,7 @@ def unpack_commands(records: np.ndarray) -> JointCommands:
     Any finite number passes: limiting is for who obeys.
 
     Raises:
-        WireError: a value that is not finite.
+        ProtocolError: a value that is not finite.
     """
     floats = records.view("<f4").reshape(-1, 5)
     if not np.isfinite(floats).all():
@@ -125,7 +125,7 @@ def pack_states(states: JointStates) -> np.ndarray:
     """Return records (N,) of `JOINT_STATE`.
 
     Raises:
-        WireError: a value that is not finite as a 32-bit float.
+        ProtocolError: a value that is not finite as a 32-bit float.
     """
     records = _pack(states, JOINT_STATE, ("tau", "dq", "ddq", "q"))
     motors = records["motors"]
@@ -139,7 +139,7 @@ def unpack_states(records: np.ndarray) -> JointStates:
     """Return the states in records (N,) of `JOINT_STATE`, or of `JOINT_STATE_OLD` with motors that report nothing.
 
     Raises:
-        WireError: a value that is not finite, or that no Z1 can have.
+        ProtocolError: a value that is not finite, or that no Z1 can have.
     """
     # Through the bytes: a structured array costs several times as much to look through, 500 times a second.
     raw = records.view(np.uint8).reshape(len(records), -1)
@@ -164,15 +164,15 @@ def _pack(values: JointCommands | JointStates, dtype: np.dtype, names: tuple[str
     return records
 
 
-def _not_finite(records: np.ndarray, names: tuple[str, ...]) -> WireError:
+def _not_finite(records: np.ndarray, names: tuple[str, ...]) -> ProtocolError:
     name = next(name for name in names if not np.isfinite(records[name]).all())
     joint = int(np.argmin(np.isfinite(records[name])))
-    return WireError(f"{name} of {z1.JOINT_NAMES[joint]} is {records[name][joint]}; it must be finite.")
+    return ProtocolError(f"{name} of {z1.JOINT_NAMES[joint]} is {records[name][joint]}; it must be finite.")
 
 
-def _not_plausible(values: np.ndarray) -> WireError:
+def _not_plausible(values: np.ndarray) -> ProtocolError:
     joint, column = divmod(int(np.argmin(np.abs(values) <= _PLAUSIBLE)), len(_FIELDS))
-    return WireError(
+    return ProtocolError(
         f"{_FIELDS[column]} of {z1.JOINT_NAMES[joint]} is {values[joint, column]}; a Z1 never measures beyond "
         f"±{_PLAUSIBLE[column]:g} (SI units)."
     )

@@ -48,7 +48,7 @@ class YoloConfig:
             raise InvalidValueError(f"max_detections is {self.max_detections}; allowed is 1 or more.")
 
 
-class YoloDetector:
+class YoloModel:
     """Finds objects by a YOLOv8 (or 11) that detects or segments. Safe to call from several threads."""
 
     def __init__(self, config: YoloConfig | None = None) -> None:

@@ -15,14 +15,14 @@ import numpy as np
 
 from hal.base.errors import InvalidValueError
 from models.nvidia.errors import GeneratorError
-from models.nvidia.wire import PROTOCOL, WireError, read_message, write_message
+from models.nvidia.wire import PROTOCOL, PipeError, read_message, write_message
 from models.types import GraspSet, check_object_cloud
 
 WORKER = Path(__file__).with_name("worker.py")
 _ENDING_S = 2.0
 _LAST_LINES = 12
 
-_Answer = dict[str, np.ndarray] | WireError | None
+_Answer = dict[str, np.ndarray] | PipeError | None
 
 
 class ProcessGenerator:
@@ -158,7 +158,7 @@ class _Child:
             raise GeneratorError(f"gave no answer in {timeout_s:g} s and was ended.") from None
         except OSError:
             answer = None
-        if isinstance(answer, WireError):
+        if isinstance(answer, PipeError):
             raise GeneratorError(f"gave no proper answer: {answer}")
         if answer is None:
             _end(self._process)
@@ -190,7 +190,7 @@ def _read_answers(stream: BinaryIO, answers: SimpleQueue[_Answer]) -> None:
         while (message := read_message(stream)) is not None:
             answers.put(message)
         answers.put(None)
-    except WireError as err:
+    except PipeError as err:
         answers.put(err)
 
 

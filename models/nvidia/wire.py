@@ -20,7 +20,7 @@ _LENGTH = struct.Struct("<Q")
 _MAX_BYTES = 256 << 20
 
 
-class WireError(Z1Error, RuntimeError):
+class PipeError(Z1Error, RuntimeError):
     """What came is no message: cut off, too long, or not arrays."""
 
     default_code = "pipe"
@@ -38,21 +38,21 @@ def read_message(stream: BinaryIO) -> dict[str, np.ndarray] | None:
     """Return the next message of `stream`, or None where it has ended.
 
     Raises:
-        WireError: it ends within a message, or what comes is none.
+        PipeError: it ends within a message, or what comes is none.
     """
     head = stream.read(_LENGTH.size)
     if not head:
         return None
     if len(head) < _LENGTH.size:
-        raise WireError("the stream ended within a message.")
+        raise PipeError("the stream ended within a message.")
     (length,) = _LENGTH.unpack(head)
     if length > _MAX_BYTES:
-        raise WireError(f"a message of {length} bytes is announced; allowed are {_MAX_BYTES}. Was something printed?")
+        raise PipeError(f"a message of {length} bytes is announced; allowed are {_MAX_BYTES}. Was something printed?")
     body = stream.read(length)
     if len(body) < length:
-        raise WireError("the stream ended within a message.")
+        raise PipeError("the stream ended within a message.")
     try:
         with np.load(io.BytesIO(body), allow_pickle=False) as file:
             return {name: file[name] for name in file.files}
     except Exception as err:  # NumPy and zipfile raise a dozen kinds for bytes that are no .npz
-        raise WireError(f"a message holds no plain arrays ({err}).") from err
+        raise PipeError(f"a message holds no plain arrays ({err}).") from err

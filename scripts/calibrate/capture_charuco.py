@@ -27,7 +27,7 @@ from scripts.calibrate.calibration_samples import now
 from scripts.support.calibration_robot import RobotOptions, open_robot
 
 if TYPE_CHECKING:
-    from sim_twin.ground_truth import Truth
+    from sim_twin.ground_truth import GroundTruth
     from z1_runtime.calibration_session.capture import Capture, Key, Taken
 
 
@@ -72,7 +72,7 @@ def capture(config: Config, console: Console, pressed: Callable[[], Key] | None 
     """
     from z1_runtime.calibration_session.board_search import BoardSearch
     from z1_runtime.calibration_session.capture import Capture
-    from z1_runtime.visualization.rerun_logger import Inspector
+    from z1_runtime.visualization.rerun_logger import RerunLogger
 
     if config.poses < 1 or not 0.0 < config.speed <= 1.0:
         raise InvalidValueError(
@@ -80,7 +80,7 @@ def capture(config: Config, console: Console, pressed: Callable[[], Key] | None 
         )
     folder = config.out or new_folder()
     with ExitStack() as undo:
-        inspector = Inspector(folder / "capture.rrd" if config.view else None, live=config.view)
+        inspector = RerunLogger(folder / "capture.rrd" if config.view else None, live=config.view)
         undo.callback(inspector.close)
         robot = undo.enter_context(open_robot(config.robot, config.board, config.seed))
         devices = {"arm": robot.arm, "camera": robot.camera, "clock": robot.clock, "board": config.board}
@@ -128,7 +128,7 @@ def terminal_key() -> Key:
     return "end" if not line or line.strip().lower().startswith("q") else "take"
 
 
-def twin_truth(truth: Callable[[], Truth] | None) -> dict | None:
+def twin_truth(truth: Callable[[], GroundTruth] | None) -> dict | None:
     """Return what a session keeps of the twin's truth; None where nobody knows it."""
     if truth is None:
         return None

@@ -61,14 +61,14 @@ def main(config: Config, ask: Ask = input) -> int:
     """Point at corners; 0 when all are within the tolerance."""
     from z1_runtime.calibration_session.board_search import BoardSearch
     from z1_runtime.calibration_session.tip_check import TouchConfig, TouchTest
-    from z1_runtime.perception.extrinsics import find_mount
+    from z1_runtime.perception.extrinsics import find_extrinsics
 
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
     console = Console(highlight=False)
     touch_config = TouchConfig(n=config.corners, height_m=config.height_m, speed=config.speed)
     with ExitStack() as undo:
         robot = undo.enter_context(open_robot(config.robot, config.board, config.seed))
-        mount = find_mount(robot.camera.wait_for_frame(5.0).serial, config.calibration, config.calibrations)
+        mount = find_extrinsics(robot.camera.wait_for_frame(5.0).serial, config.calibration, config.calibrations)
         console.print(f"camera: {mount.origin}", soft_wrap=True)
         robot.arm.claim("verify")
         search = BoardSearch(

@@ -185,7 +185,7 @@ def _pictures(rows: list[Row], config: Config, runtime: RuntimeConfig, shapes: d
     """Draw pictures, and make the recordings that go with them: episodes are the same whenever they are run."""
     from sim_twin.benchmark.episodes.episode import record_scenario, recording_name
     from sim_twin.benchmark.episodes.methods import parse_method
-    from sim_twin.benchmark.episodes.runner import make_decider
+    from sim_twin.benchmark.episodes.runner import make_grasp_selector
     from sim_twin.benchmark.episodes.scenarios import Scenario
     from sim_twin.benchmark.report.pictures import draw_pictures
 
@@ -194,7 +194,7 @@ def _pictures(rows: list[Row], config: Config, runtime: RuntimeConfig, shapes: d
         scenario, method = Scenario.of(row, shapes), parse_method(row["method"])
         path = folder / recording_name(scenario, method)
         if config.recordings == "shown" and not path.exists():
-            record_scenario(scenario, method, lambda s, seed: make_decider(runtime, s, seed), folder)
+            record_scenario(scenario, method, lambda s, seed: make_grasp_selector(runtime, s, seed), folder)
         link = path.relative_to(config.out).as_posix() if path.exists() else ""
         pictures.append(replace(picture, recording=link))
     return pictures

@@ -23,13 +23,13 @@ from hal.base.messages import ServoStatus
 from hal.bus.session import BusConfig
 from scripts.commands.run_hal import TWINS
 from scripts.support.hal_process import HalProcess
-from scripts.support.rig_option import RigWord
+from scripts.support.rig_option import RigOption
 from sim_twin.model.scene import SceneConfig
 
 if TYPE_CHECKING:  # planner and viewer take seconds to load: that happens beside the HAL's own start
     from scripts.support.demo_robot import DemoRobot
-    from sim_twin.ground_truth import Truth
-    from z1_runtime.tasks.pick import Phase, PickPipeline, PickRecord
+    from sim_twin.ground_truth import GroundTruth
+    from z1_runtime.tasks.pick import Phase, PickResult, PickTask
 
 WIRED_LEAD_S = 0.5
 """How much motion waits at the servo when the twin lives in processes of its own [s]; its watchdogs are the same."""
@@ -41,7 +41,7 @@ LIFTED_M = 0.05
 class Config:
     """What stands where, and what is written."""
 
-    rig: Annotated[RigWord, tyro.conf.arg(name="")] = field(default_factory=RigWord)
+    rig: Annotated[RigOption, tyro.conf.arg(name="")] = field(default_factory=RigOption)
     """Which hardware; a demo is of the twin's."""
     object: str = "bottle"
     """bottle, box or cylinder."""
@@ -142,15 +142,15 @@ def _start_hal(config: Config, scene: SceneConfig, undo: ExitStack) -> HalProces
 
 def _assemble(
     config: Config, scene: SceneConfig, process: HalProcess | None, console: Console, undo: ExitStack
-) -> tuple[DemoRobot, PickPipeline]:
+) -> tuple[DemoRobot, PickTask]:
     """Return the robot, claimed, and what will pick with it; `undo` takes them apart again."""
     from scripts.support.demo_robot import lockstep_robot, remote_robot
     from z1_runtime.config import load_config, save_config, with_detector, with_generator
-    from z1_runtime.factory import make_decider
-    from z1_runtime.perception.extrinsics import find_mount
-    from z1_runtime.tasks.pick import PickPipeline
-    from z1_runtime.visualization.live_view import FrameTap
-    from z1_runtime.visualization.rerun_logger import Inspector
+    from z1_runtime.factory import make_grasp_selector
+    from z1_runtime.perception.extrinsics import find_extrinsics
+    from z1_runtime.tasks.pick import PickTask
+    from z1_runtime.visualization.live_view import LiveView
+    from z1_runtime.visualization.rerun_logger import RerunLogger
 
     runtime = replace(load_config(config.config), seed=config.seed, object_class=config.object)
     runtime = with_detector(runtime, config.detector, config.detector_weights, config.crop)
@@ -159,21 +159,21 @@ def _assemble(
         lead_s = max(runtime.executor.lead_s, WIRED_LEAD_S)
         runtime = replace(runtime, executor=replace(runtime.executor, lead_s=lead_s))
     save_config(runtime, config.out / "config.yaml")
-    mount = find_mount(scene.camera_serial(), config.calibration)
+    mount = find_extrinsics(scene.camera_serial(), config.calibration)
     console.print(f"  {'camera':<9} {mount.origin}", soft_wrap=True)
-    decider = make_decider(runtime, mount.T_flange_camera)
+    decider = make_grasp_selector(runtime, mount.T_flange_camera)
     decider.warm_up()
-    inspector = Inspector(config.out / "episode.rrd", live=config.view)
+    inspector = RerunLogger(config.out / "episode.rrd", live=config.view)
     undo.callback(inspector.close)
     robot = undo.enter_context(remote_robot(process, config.bus) if process else lockstep_robot(scene))
     robot.arm.claim("demo")  # given back by its disconnecting, which forgives a HAL that is gone
     if process:
-        undo.enter_context(FrameTap(robot.camera, robot.arm, inspector, mount.T_flange_camera))
+        undo.enter_context(LiveView(robot.camera, robot.arm, inspector, mount.T_flange_camera))
 
     def say(phase: Phase) -> None:
         console.print(f"  {phase.name:<9} {phase.duration_s:6.2f} s")
 
-    pipeline = PickPipeline(
+    pipeline = PickTask(
         decider=decider,
         arm=robot.arm,
         camera=robot.camera,
@@ -185,11 +185,11 @@ def _assemble(
     return robot, pipeline
 
 
-def _pick(robot: DemoRobot, pipeline: PickPipeline, process: HalProcess | None, summary: dict[str, Any]) -> Truth:
+def _pick(robot: DemoRobot, pipeline: PickTask, process: HalProcess | None, summary: dict[str, Any]) -> GroundTruth:
     """Pick once, fill `summary`, and return the truth afterwards.
 
     Raises:
-        HalError: as `PickPipeline.pick`; of a HAL process that has ended, its own last words.
+        HalError: as `PickTask.pick`; of a HAL process that has ended, its own last words.
     """
     try:
         record = pipeline.pick()
@@ -213,7 +213,7 @@ def _identity(config: Config) -> dict[str, Any]:
     }
 
 
-def summarise(robot: DemoRobot, record: PickRecord, truth: Truth) -> dict[str, Any]:
+def summarise(robot: DemoRobot, record: PickResult, truth: GroundTruth) -> dict[str, Any]:
     """Return what summary.json holds of a pick that was executed."""
     status = robot.arm.status()
     decision = record.decision

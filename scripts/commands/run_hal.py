@@ -27,7 +27,7 @@ from hal.process import serve, stop_on_signals
 from hal.rig import RIGS, Rig
 from hal.servo.guard import Workspace
 from scripts.support.hal_process import READY
-from scripts.support.rig_option import RigWord
+from scripts.support.rig_option import RigOption
 
 TWINS = ("sim", "wire-sim")
 """Rigs that are made of a scene."""
@@ -37,7 +37,7 @@ TWINS = ("sim", "wire-sim")
 class Config:
     """Which hardware, where, and for the twin what stands on the table."""
 
-    rig: Annotated[RigWord, tyro.conf.arg(name="")] = field(default_factory=RigWord)
+    rig: Annotated[RigOption, tyro.conf.arg(name="")] = field(default_factory=RigOption)
     """Which hardware."""
     arm: Z1ArmConfig = field(default_factory=lambda: Z1ArmConfig(connect_timeout_s=SEARCH_S))
     """Real: where the Z1's controller is, and how it is used."""
@@ -85,9 +85,9 @@ def main(config: Config) -> int:
 
         def ready() -> None:
             if rig.world is not None:
-                from sim_twin.ground_truth import TruthServer
+                from sim_twin.ground_truth import GroundTruthServer
 
-                undo.callback(TruthServer(config.bus, rig.world).close)
+                undo.callback(GroundTruthServer(config.bus, rig.world).close)
             print(READY, flush=True)
 
         serve(

@@ -20,7 +20,7 @@ from hal.bus.client import RemoteArm, RemoteCamera
 from hal.bus.session import BusConfig
 
 if TYPE_CHECKING:
-    from z1_runtime.tasks.pick import PickPipeline
+    from z1_runtime.tasks.pick import PickTask
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,28 +70,28 @@ def main(config: Config) -> int:
     return 0 if record.held else 1
 
 
-def _assemble(config: Config, arm: RemoteArm, camera: RemoteCamera, console: Console, undo: ExitStack) -> PickPipeline:
+def _assemble(config: Config, arm: RemoteArm, camera: RemoteCamera, console: Console, undo: ExitStack) -> PickTask:
     """Return what picks; `undo` ends what it writes."""
     from z1_runtime.config import load_config, with_detector, with_generator
-    from z1_runtime.factory import make_decider
-    from z1_runtime.perception.extrinsics import find_mount
-    from z1_runtime.tasks.pick import PickPipeline
-    from z1_runtime.visualization.live_view import FrameTap
-    from z1_runtime.visualization.rerun_logger import Inspector
+    from z1_runtime.factory import make_grasp_selector
+    from z1_runtime.perception.extrinsics import find_extrinsics
+    from z1_runtime.tasks.pick import PickTask
+    from z1_runtime.visualization.live_view import LiveView
+    from z1_runtime.visualization.rerun_logger import RerunLogger
 
     runtime = with_detector(load_config(config.config), config.detector, config.detector_weights, config.crop)
     runtime = with_generator(runtime, config.generator, config.generator_weights)
     if config.object:
         runtime = replace(runtime, object_class=config.object)
-    mount = find_mount(camera.wait_for_frame(runtime.frame_timeout_s).serial, config.calibration)
+    mount = find_extrinsics(camera.wait_for_frame(runtime.frame_timeout_s).serial, config.calibration)
     console.print(f"  {'camera':<9} {mount.origin}", soft_wrap=True)
-    decider = make_decider(runtime, mount.T_flange_camera)
+    decider = make_grasp_selector(runtime, mount.T_flange_camera)
     decider.warm_up()
-    inspector = Inspector(config.out / "episode.rrd" if config.out else None, live=config.view)
+    inspector = RerunLogger(config.out / "episode.rrd" if config.out else None, live=config.view)
     undo.callback(inspector.close)
     if config.out or config.view:
-        undo.enter_context(FrameTap(camera, arm, inspector, mount.T_flange_camera))
-    return PickPipeline(
+        undo.enter_context(LiveView(camera, arm, inspector, mount.T_flange_camera))
+    return PickTask(
         decider=decider,
         arm=arm,
         camera=camera,

@@ -13,7 +13,7 @@ from hal.base.clock import WallClock
 from hal.base.messages import ServoMode, ServoStatus
 from hal.bus import keys
 from hal.bus.codec import decode
-from hal.bus.link import Link
+from hal.bus.link import BusLink
 from hal.bus.session import BusConfig
 
 
@@ -38,7 +38,7 @@ def main(config: StopConfig) -> int:
         HalTimeoutError: no HAL process answers.
     """
     # Not `RemoteArm`: it waits for the arm's first state, and a stop must get through to an arm that sends none.
-    link = Link(config.bus, WallClock(), "the arm")
+    link = BusLink(config.bus, WallClock(), "the arm")
     try:
         link.ask(keys.STOP, config.reason.encode(), "stop command")
         status = wait_for_mode(lambda: decode(link.ask(keys.READ_STATUS), ServoStatus), ServoMode.STOPPED)

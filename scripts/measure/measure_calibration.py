@@ -27,7 +27,7 @@ from scripts.calibrate.calibration_samples import SeenSamples, now, read_samples
 from scripts.commands import run_demo
 from scripts.support.calibration_robot import RobotOptions, make_scene
 from sim_twin.backends import make_rig
-from sim_twin.ground_truth import read_truth
+from sim_twin.ground_truth import read_ground_truth
 from z1_runtime.calibration_session.board_search import BoardSearch
 from z1_runtime.calibration_session.capture import Capture
 
@@ -151,7 +151,7 @@ def _capture_by_jumps(scene: SceneConfig, poses: int, folder: Path) -> None:
     rig.camera.connect()
     devices: dict[str, Any] = {"arm": rig.arm, "camera": rig.camera, "clock": rig.clock, "board": Board()}
     capture = Capture(**devices, folder=folder)
-    capture.open(now(), capture_charuco.twin_truth(lambda: read_truth(rig.world)))
+    capture.open(now(), capture_charuco.twin_truth(lambda: read_ground_truth(rig.world)))
     for _ in capture.drive(_JumpingSearch(rig.world, **devices, rest_s=0.1), poses, scene.seed):
         pass
     rig.camera.disconnect()

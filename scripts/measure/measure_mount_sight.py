@@ -21,7 +21,7 @@ from hal.base.clock import Stopwatch
 from hal.base.transforms import inverse
 from sim_twin.benchmark.episodes.scenarios import PAPER_OBJECTS, grid
 from sim_twin.benchmark.episodes.trial import look
-from z1_runtime.perception.extrinsics_check import MountSight
+from z1_runtime.perception.extrinsics_check import ExtrinsicsCheck
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,7 +38,7 @@ class Config:
 
 def main(config: Config) -> None:
     """Look, and say how far beside its place what is 0.4 m ahead is shown."""
-    sight = MountSight()
+    sight = ExtrinsicsCheck()
     poses = list(grid(PAPER_OBJECTS))
     before, after, corrected, times = [], [], 0, []
     for number in track(range(config.looks), description="looks"):

@@ -17,7 +17,7 @@ from hal.base.errors import HalTimeoutError
 from hal.bus.session import BusConfig
 
 if TYPE_CHECKING:
-    from sim_twin.ground_truth import Truth
+    from sim_twin.ground_truth import GroundTruth
     from sim_twin.model.charuco_board import BoardSpec
     from sim_twin.model.scene import SceneConfig
 
@@ -55,7 +55,7 @@ class CalibrationRobot:
     arm: ServoedArm
     camera: Camera
     clock: Clock
-    truth: Callable[[], Truth] | None
+    truth: Callable[[], GroundTruth] | None
     """Where everything really is; None where nobody knows."""
 
 
@@ -93,11 +93,11 @@ def _served_robot(bus: BusConfig, undo: ExitStack) -> CalibrationRobot:
     return CalibrationRobot(arm=arm, camera=camera, clock=clock, truth=_served_truth(bus, undo))
 
 
-def _served_truth(bus: BusConfig, undo: ExitStack) -> Callable[[], Truth] | None:
+def _served_truth(bus: BusConfig, undo: ExitStack) -> Callable[[], GroundTruth] | None:
     """Return the truth if the HAL is a twin's with a board on its table."""
-    from sim_twin.ground_truth import TruthClient
+    from sim_twin.ground_truth import GroundTruthClient
 
-    client = undo.enter_context(TruthClient(bus))
+    client = undo.enter_context(GroundTruthClient(bus))
     try:
         return client.truth if client.truth().T_base_board is not None else None
     except HalTimeoutError:

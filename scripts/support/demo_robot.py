@@ -14,7 +14,7 @@ from hal.bus.session import BusConfig
 from hal.servo.guard import Guard
 from hal.servo.servo import Servo
 from scripts.support.hal_process import HalProcess
-from sim_twin.ground_truth import Truth, TruthClient, read_truth
+from sim_twin.ground_truth import GroundTruth, GroundTruthClient, read_ground_truth
 from sim_twin.model.scene import SceneConfig
 
 
@@ -25,7 +25,7 @@ class DemoRobot:
     arm: ServoedArm
     camera: Camera
     clock: Clock
-    truth: Callable[[], Truth]
+    truth: Callable[[], GroundTruth]
     """Where everything really is."""
     frame_ms: Callable[[float], float]
     """A percentile of the frame latency over Zenoh [ms]; 0 in lock-step."""
@@ -49,7 +49,7 @@ def lockstep_robot(scene: SceneConfig) -> Iterator[DemoRobot]:
             arm=servo,
             camera=rig.camera,
             clock=rig.clock,
-            truth=lambda: read_truth(rig.world),
+            truth=lambda: read_ground_truth(rig.world),
             frame_ms=lambda _: 0.0,
         )
 
@@ -65,7 +65,7 @@ def remote_robot(process: HalProcess, bus: BusConfig) -> Iterator[DemoRobot]:
         undo.callback(arm.disconnect)
         camera.connect()
         undo.callback(camera.disconnect)
-        evaluation = undo.enter_context(TruthClient(bus))
+        evaluation = undo.enter_context(GroundTruthClient(bus))
         yield DemoRobot(
             arm=arm,
             camera=camera,

@@ -203,9 +203,9 @@ def _detector_ms(runtime: str) -> float:
     import numpy as np
 
     from hal.base.clock import Stopwatch
-    from models.detector.detector import YoloConfig, YoloDetector
+    from models.detector.detector import YoloConfig, YoloModel
 
-    detector, image = YoloDetector(YoloConfig(runtime=runtime)), np.full((480, 640, 3), 127, np.uint8)
+    detector, image = YoloModel(YoloConfig(runtime=runtime)), np.full((480, 640, 3), 127, np.uint8)
     watch, times = Stopwatch(), []
     for _ in range(9):
         watch.lap_ms()

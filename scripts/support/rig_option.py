@@ -14,7 +14,7 @@ DEFAULT = "sim"
 
 
 @dataclass(frozen=True, kw_only=True)
-class RigWord:
+class RigOption:
     """Which rig; at most one of these."""
 
     hal: Annotated[str, _ONE_OF_THEM] = DEFAULT

@@ -25,7 +25,7 @@ from rich.table import Table
 from hal.base import z1
 from hal.base.clock import Stopwatch
 from hal.base.errors import MissingFileError
-from models.detector.detector import YoloConfig, YoloDetector, best_of, labels_for
+from models.detector.detector import YoloConfig, YoloModel, best_of, labels_for
 from models.detector.weights import detector_path
 from models.types import Detection
 from scripts.train.detection_measures import Tally, mask_iou, match
@@ -33,7 +33,7 @@ from scripts.train.make_detection_dataset import read_labels
 from sim_twin.benchmark.episodes.scenarios import PAPER_OBJECTS, Scenario, grid
 from sim_twin.camera.d405 import INTRINSICS, measure_colour
 from sim_twin.detection_data.props import CLASSES
-from sim_twin.detection_data.scenes import Label, Look, Picture, draw_scenario
+from sim_twin.detection_data.scenes import Appearance, Label, Picture, draw_scenario
 
 WANTED = {
     "box_map50": 0.97,
@@ -71,13 +71,13 @@ class Config:
 
 def main(config: Config) -> None:
     """Measure, print and write."""
-    detector = YoloDetector(YoloConfig(weights=config.weights, runtime=config.runtime))
+    detector = YoloModel(YoloConfig(weights=config.weights, runtime=config.runtime))
     figures = {"runtime": detector.runtime, "min_confidence": detector.config.min_confidence}
-    lavish = YoloDetector(replace(detector.config, every_class=True, max_detections=_MOST_RANKED))
+    lavish = YoloModel(replace(detector.config, every_class=True, max_detections=_MOST_RANKED))
     figures |= measure_held_out(detector, lavish, config.data, config.most)
     figures |= measure_empty(detector, config.data)
     tiles = []
-    for look in get_args(Look):
+    for look in get_args(Appearance):
         seen = measure_views(detector, twin_views() if look == "twin" else spoilt_views(look), look)
         figures |= seen.figures
         tiles += seen.tiles
@@ -88,7 +88,7 @@ def main(config: Config) -> None:
     Console().print(_table(figures))
 
 
-def measure_held_out(detector: YoloDetector, lavish: YoloDetector, data: Path, most: int) -> dict[str, object]:
+def measure_held_out(detector: YoloModel, lavish: YoloModel, data: Path, most: int) -> dict[str, object]:
     """Return mean average precision of boxes and masks over the held-out pictures, of all and by their look.
 
     Args:
@@ -127,7 +127,7 @@ def measure_held_out(detector: YoloDetector, lavish: YoloDetector, data: Path, m
     return figures
 
 
-def measure_empty(detector: YoloDetector, data: Path) -> dict[str, object]:
+def measure_empty(detector: YoloModel, data: Path) -> dict[str, object]:
     """Return how often something is seen where nothing is, at the default threshold."""
     images = _images(data, "empty")
     most = [max((d.confidence for d in detector.detect(read_image(i), 0.05)), default=0.0) for i in images]
@@ -166,7 +166,7 @@ def twin_views() -> Iterator[tuple[Scenario, Picture]]:
         renderer.close()
 
 
-def spoilt_views(look: Look) -> Iterator[tuple[Scenario, Picture]]:
+def spoilt_views(look: Appearance) -> Iterator[tuple[Scenario, Picture]]:
     """Yield the same poses, each in a room and through a camera of its own."""
     from sim_twin.detection_data.scene_renderer import Stage
 
@@ -189,7 +189,7 @@ class Seen:
     """Some of the views, drawn on."""
 
 
-def measure_views(detector: YoloDetector, views: Iterator[tuple[Scenario, Picture]], look: str) -> Seen:
+def measure_views(detector: YoloModel, views: Iterator[tuple[Scenario, Picture]], look: str) -> Seen:
     """Return in how many of the 81 views the right object is found with an IoU of at least 0.8, and which fail."""
     ious: dict[str, float] = {}
     tiles = []
@@ -208,7 +208,7 @@ def measure_views(detector: YoloDetector, views: Iterator[tuple[Scenario, Pictur
     return Seen(figures=figures, tiles=tiles)
 
 
-def measure_time(detector: YoloDetector, repeats: int) -> dict[str, object]:
+def measure_time(detector: YoloModel, repeats: int) -> dict[str, object]:
     """Return the median time of a look at 640×480 [ms]."""
     image = next(twin_views())[1].colour
     detector.detect(image)
@@ -220,7 +220,7 @@ def measure_time(detector: YoloDetector, repeats: int) -> dict[str, object]:
     return {"median_ms": round(float(np.median(times)), 1), "p90_ms": round(float(np.quantile(times, 0.9)), 1)}
 
 
-def write_sheet(detector: YoloDetector, data: Path, tiles: list[np.ndarray], path: Path) -> None:
+def write_sheet(detector: YoloModel, data: Path, tiles: list[np.ndarray], path: Path) -> None:
     """Write a sheet of what was found: some scenario views, then the first held-out pictures."""
     images = _images(data, "val")
     held_out = [read_image(image) for image in images[:: max(len(images) // 10, 1)][:10]]

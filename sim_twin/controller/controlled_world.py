@@ -7,7 +7,7 @@ import numpy as np
 from hal.base import z1
 from hal.z1_protocol.board import PERIOD_S
 from hal.z1_protocol.controller import decode_command, encode_state
-from hal.z1_protocol.records import JointStates, WireError
+from hal.z1_protocol.records import JointStates, ProtocolError
 from hal.z1_protocol.states import Fsm
 from sim_twin.controller.controller import Controller
 from sim_twin.controller.motors import Motors
@@ -57,7 +57,7 @@ class ControlledWorld:
         """Obey a datagram; False when it was refused and counted. Never raises."""
         try:
             self.controller.obey(decode_command(data))
-        except WireError as error:
+        except ProtocolError as error:
             self.refused += 1
             self.last_refusal = str(error)
             return False

@@ -14,7 +14,7 @@ from hal.z1_protocol.board import (
     encode_self_check,
     encode_state,
 )
-from hal.z1_protocol.records import JointStates, MotorLink, WireError
+from hal.z1_protocol.records import JointStates, MotorLink, ProtocolError
 from sim_twin.controller.motors import Motors
 from sim_twin.model.world import World
 
@@ -52,12 +52,12 @@ class ArmBoard:
             return encode_self_check(self._self_check())
         try:
             if len(data) in COMMAND_SIZES and len(data) != COMMAND_SIZES[not self._gripper]:
-                raise WireError(
+                raise ProtocolError(
                     f"the command has {len(data)} bytes; of this board, with {self._n} joints, they have "
                     f"{COMMAND_SIZES[not self._gripper]}."
                 )
             self.motors.obey(decode_command(data))
-        except WireError as error:
+        except ProtocolError as error:
             self.refused += 1
             self.last_refusal = str(error)
             return None

@@ -25,7 +25,7 @@ from sim_twin.detection_data.scene_renderer import Actor, Stage
 if TYPE_CHECKING:
     from hal.base.messages import Intrinsics
 
-Look = Literal["twin", "own", "any"]
+Appearance = Literal["twin", "own", "any"]
 """How things look: all as in the twin; our objects in their own colours, the rest at random; all at random."""
 LEAST_PIXELS = 600
 """An object that shows fewer pixels at 640×480 is taken out of the scene."""
@@ -60,7 +60,7 @@ class Picture:
     """(H, W, 3) uint8, RGB."""
     labels: tuple[Label, ...]
     """Nothing else in the picture is a bottle, a cylinder or a box."""
-    look: Look
+    look: Appearance
     """How it was dressed."""
 
 
@@ -118,13 +118,19 @@ def draw_scene(stage: Stage, rng: np.random.Generator, mix: SceneMix | None = No
     return Picture(colour=spoil_photo(colour, rng), labels=labels, look=look)
 
 
-def _choose_look(rng: np.random.Generator, mix: SceneMix) -> Look:
+def _choose_look(rng: np.random.Generator, mix: SceneMix) -> Appearance:
     share = rng.random()
     return "twin" if share < mix.twin else "own" if share < mix.twin + mix.own else "any"
 
 
 def draw_scenario(
-    stage: Stage, name: str, T_base_object: np.ndarray, rng: np.random.Generator, *, look: Look, jaw_rad: float = -1.0
+    stage: Stage,
+    name: str,
+    T_base_object: np.ndarray,
+    rng: np.random.Generator,
+    *,
+    look: Appearance,
+    jaw_rad: float = -1.0,
 ) -> Picture:
     """Return the picture from home of one benchmark object at `T_base_object` (4, 4), by the light of any room."""
     stage.clear()
@@ -137,7 +143,7 @@ def draw_scenario(
     return Picture(colour=spoil_photo(colour, rng), labels=labels, look=look)
 
 
-def _dress(stage: Stage, look: Look, objects: list[Actor], rng: np.random.Generator) -> None:
+def _dress(stage: Stage, look: Appearance, objects: list[Actor], rng: np.random.Generator) -> None:
     if look == "twin":
         dress_as_twin(stage)
     else:

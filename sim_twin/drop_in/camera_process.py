@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from hal.base.clock import Clock, WallClock
-from hal.base.d405 import MIN_Z_M, Calibration, Exposure, Look
+from hal.base.d405 import MIN_Z_M, CaptureRequest, D405Calibration, Exposure
 from sim_twin.drop_in.child_process import ChildProcess
 from sim_twin.drop_in.process import WireProcess, load_model
 from sim_twin.drop_in.shared_memory import SharedWorld, make_memory, map_memory
@@ -33,9 +33,9 @@ class RemoteSource:
 
     lockstep = False
 
-    def __init__(self, twin: WireProcess, calibration: Calibration | None = None) -> None:
+    def __init__(self, twin: WireProcess, calibration: D405Calibration | None = None) -> None:
         self.clock: Clock = WallClock()
-        self.calibration = calibration if calibration is not None else Calibration()
+        self.calibration = calibration if calibration is not None else D405Calibration()
         self.attached = True
         """Set it to False to pull the cable."""
         self.world = twin
@@ -59,7 +59,7 @@ class RemoteSource:
         child.wait_ready()
         self._child = child
 
-    def expose(self, look: Look) -> Exposure:
+    def expose(self, look: CaptureRequest) -> Exposure:
         """Return what the imagers see now.
 
         Raises:
@@ -74,7 +74,7 @@ class RemoteSource:
 
     def warm_up(self, width: int = 848, height: int = 480) -> None:
         """Start the process and draw once, so that the first frame is as quick as the others."""
-        self.expose(Look(number=0, width=width, height=height, depth=True, colour=True))
+        self.expose(CaptureRequest(number=0, width=width, height=height, depth=True, colour=True))
 
     def reset(self) -> None:
         """Nothing hangs in here."""
@@ -105,7 +105,9 @@ class _SharedView(SceneView):
         return self._shared.read()
 
 
-def serve(connection: Connection, scene: SceneConfig, calibration: Calibration, files: tuple[int, int, int]) -> None:
+def serve(
+    connection: Connection, scene: SceneConfig, calibration: D405Calibration, files: tuple[int, int, int]
+) -> None:
     """Be the third process: draw what is asked for until the connection is closed.
 
     Raises:
@@ -126,7 +128,7 @@ def serve(connection: Connection, scene: SceneConfig, calibration: Calibration, 
             connection.send((exposure.stamp_s, present))
 
 
-def _image(frame: np.ndarray, name: str, look: Look) -> np.ndarray:
+def _image(frame: np.ndarray, name: str, look: CaptureRequest) -> np.ndarray:
     """Return the image `name` (H, W) or (H, W, 3) inside the shared frame."""
     shape = (look.height, look.width) if name == "depth" else (look.height, look.width, 3)
     return frame[name][: int(np.prod(shape))].reshape(shape)

@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from hal.base.clock import Clock, WallClock
-from hal.base.d405 import BASELINE_M, DEPTH_UNIT_M, MIN_Z_M, Calibration, Exposure, Look
+from hal.base.d405 import BASELINE_M, DEPTH_UNIT_M, MIN_Z_M, CaptureRequest, D405Calibration, Exposure
 from hal.base.messages import Intrinsics
 from sim_twin.backends import give_way
 from sim_twin.camera import d405
@@ -39,7 +39,7 @@ class TwinSource:
         world: SceneView,
         clock: Clock | None = None,
         renderer: str | None = None,
-        calibration: Calibration | None = None,
+        calibration: D405Calibration | None = None,
         *,
         gives_way: bool = True,
     ) -> None:
@@ -48,7 +48,7 @@ class TwinSource:
             clock = TwinClock(world) if isinstance(world, World) else WallClock()
         self.clock: Clock = clock
         self.lockstep = isinstance(self.clock, TwinClock)
-        self.calibration = calibration if calibration is not None else Calibration()
+        self.calibration = calibration if calibration is not None else D405Calibration()
         self.attached = True
         """Set it to False to pull the cable."""
         self._kind = renderer
@@ -58,7 +58,7 @@ class TwinSource:
         self._renderer: WristRenderer | None = None
         self._thread: ThreadPoolExecutor | None = None
 
-    def expose(self, look: Look) -> Exposure:
+    def expose(self, look: CaptureRequest) -> Exposure:
         """Return what the imagers see now.
 
         Raises:
@@ -71,7 +71,7 @@ class TwinSource:
 
     def warm_up(self, width: int = 848, height: int = 480) -> None:
         """Open the renderer and draw once, so that the first frame is as quick as the others."""
-        self.expose(Look(number=0, width=width, height=height, depth=True, colour=True))
+        self.expose(CaptureRequest(number=0, width=width, height=height, depth=True, colour=True))
 
     def reset(self) -> None:
         """Nothing hangs in here."""
@@ -89,7 +89,7 @@ class TwinSource:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _expose(self, look: Look) -> Exposure:
+    def _expose(self, look: CaptureRequest) -> Exposure:
         stamp_s = self.clock.now_s()
         data = self.world.snapshot(self._snapshot)
         optics, renderer = self._prepare(look)
@@ -106,7 +106,7 @@ class TwinSource:
             right=self._measure_picture(right, look, 2),
         )
 
-    def _prepare(self, look: Look) -> tuple[Optics, WristRenderer]:
+    def _prepare(self, look: CaptureRequest) -> tuple[Optics, WristRenderer]:
         optics, renderer = self._optics, self._renderer
         if optics is None or renderer is None or (optics.depth.width, optics.depth.height) != (look.width, look.height):
             self._close_renderer()
@@ -127,7 +127,7 @@ class TwinSource:
         data.cam_xpos[number] += BASELINE_M * x_axis
         return renderer.render(data)
 
-    def _measure_depth(self, z_m: np.ndarray, pinhole: Intrinsics, look: Look) -> np.ndarray:
+    def _measure_depth(self, z_m: np.ndarray, pinhole: Intrinsics, look: CaptureRequest) -> np.ndarray:
         """Return the depth (H, W) in units."""
         config, min_z_m = self.world.config, MIN_Z_M[look.width, look.height]
         if config.noise:
@@ -136,7 +136,7 @@ class TwinSource:
             z_m = d405.round_depth(np.ascontiguousarray(z_m), min_z_m)
         return np.rint(z_m / DEPTH_UNIT_M).astype(np.uint16)
 
-    def _measure_picture(self, picture: np.ndarray | None, look: Look, imager: int) -> np.ndarray | None:
+    def _measure_picture(self, picture: np.ndarray | None, look: CaptureRequest, imager: int) -> np.ndarray | None:
         if picture is None:
             return None
         if look.brightness != 1.0:
@@ -158,7 +158,7 @@ class Optics:
         height: of the streams [px].
     """
 
-    def __init__(self, calibration: Calibration, width: int, height: int) -> None:
+    def __init__(self, calibration: D405Calibration, width: int, height: int) -> None:
         pinhole = self.depth = calibration.depth(width, height)
         u, v = _colour_in_depth(calibration, width, height)
         left, top = (int(np.floor(min(a.min(), 0.0))) - 1 for a in (u, v))
@@ -179,7 +179,7 @@ class Optics:
         return cv2.remap(wide, *self._maps, cv2.INTER_LINEAR)
 
 
-def _colour_in_depth(calibration: Calibration, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
+def _colour_in_depth(calibration: D405Calibration, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
     """Return for every colour pixel (height, width) where the depth stream's pinhole sees its ray [px]."""
     colour, depth = calibration.colour(width, height), calibration.depth(width, height)
     pixels = np.stack(np.meshgrid(np.arange(width, dtype=float), np.arange(height, dtype=float)), axis=-1)

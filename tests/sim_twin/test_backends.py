@@ -57,8 +57,8 @@ def _episode(seed: int) -> list[bytes]:
     rig.call_every_tick(tick)
     for _ in range(4):
         frame = rig.camera.wait_for_frame(1.0)
-        assert frame.truth_mask is not None
-        record.append(frame.colour.tobytes() + frame.depth_m.tobytes() + frame.truth_mask.tobytes())
+        assert frame.ground_truth_mask is not None
+        record.append(frame.colour.tobytes() + frame.depth_m.tobytes() + frame.ground_truth_mask.tobytes())
         record.append(np.array([frame.stamp_s, frame.sequence]).tobytes())
     rig.camera.disconnect()
     return record
@@ -83,12 +83,12 @@ def test_a_frame_holds_colour_depth_and_the_objects_mask(rig: Rig) -> None:
     frame: RgbdFrame = rig.camera.wait_for_frame(0.1)
     assert frame.colour.shape == (480, 640, 3)
     assert frame.intrinsics == rig.camera.intrinsics
-    assert frame.truth_mask is not None
-    inside, valid = frame.depth_m[frame.truth_mask], frame.depth_m > 0
+    assert frame.ground_truth_mask is not None
+    inside, valid = frame.depth_m[frame.ground_truth_mask], frame.depth_m > 0
     assert 0.85 < (inside > 0).mean() < 1.0  # the real one has holes
     assert np.median(inside[inside > 0]) == pytest.approx(0.35, abs=0.05)
     assert 0.5 < valid.mean() < 0.95
-    red = frame.colour[frame.truth_mask].mean(axis=0)
+    red = frame.colour[frame.ground_truth_mask].mean(axis=0)
     assert red[0] > 1.5 * red[2]  # the cylinder is red
 
 
@@ -97,8 +97,8 @@ def test_without_noise_depth_is_whole_and_colour_clean() -> None:
     camera.connect()
     first, second = camera.wait_for_frame(0.1), camera.wait_for_frame(0.1)
     camera.disconnect()
-    assert first.truth_mask is not None
-    assert (first.depth_m[first.truth_mask] > 0).all()
+    assert first.ground_truth_mask is not None
+    assert (first.depth_m[first.ground_truth_mask] > 0).all()
     # The object settles by micrometres between the frames: a pixel of its rim may differ.
     assert (first.colour != second.colour).mean() < 1e-4
 

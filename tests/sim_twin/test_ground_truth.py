@@ -15,7 +15,7 @@ from hal.base.errors import HalTimeoutError
 from hal.bus.server import HalServer
 from hal.bus.session import BusConfig
 from hal.servo.servo import Servo
-from sim_twin.ground_truth import TruthClient, TruthServer, read_truth
+from sim_twin.ground_truth import GroundTruthClient, GroundTruthServer, read_ground_truth
 from sim_twin.model.world import World
 
 
@@ -36,8 +36,8 @@ def bus() -> Iterator[BusConfig]:
 
 
 def test_the_truth_crosses_the_link_unchanged(bus: BusConfig, world: World) -> None:
-    server, here = TruthServer(bus, world), read_truth(world)
-    with TruthClient(bus) as client:
+    server, here = GroundTruthServer(bus, world), read_ground_truth(world)
+    with GroundTruthClient(bus) as client:
         there = client.truth()
     server.close()
     assert there.object == "bottle"
@@ -47,8 +47,8 @@ def test_the_truth_crosses_the_link_unchanged(bus: BusConfig, world: World) -> N
 
 
 def test_a_robot_that_is_no_twin_is_a_clear_error(bus: BusConfig, world: World) -> None:
-    TruthServer(bus, world).close()
-    with TruthClient(bus) as client, pytest.raises(HalTimeoutError, match="only a simulated HAL knows the truth"):
+    GroundTruthServer(bus, world).close()
+    with GroundTruthClient(bus) as client, pytest.raises(HalTimeoutError, match="only a simulated HAL knows the truth"):
         client.truth()
 
 

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from hal.base.clock import Clock, ManualClock
-from hal.base.d405 import Calibration, Exposure, Look
+from hal.base.d405 import CaptureRequest, D405Calibration, Exposure
 from hal.base.messages import Intrinsics
 
 WALL_UNITS = 4000
@@ -22,9 +22,9 @@ class PlainSource:
     def __init__(self, clock: Clock | None = None) -> None:
         self.clock = clock if clock is not None else ManualClock(100.0)
         self.lockstep = isinstance(self.clock, ManualClock)
-        self.calibration = Calibration()
+        self.calibration = D405Calibration()
         self.attached = True
-        self.looks: list[Look] = []
+        self.looks: list[CaptureRequest] = []
         self.resets = self.closed = 0
         self.hangs = False
         """Gives nothing."""
@@ -37,7 +37,7 @@ class PlainSource:
         self.colour_stalls = False
         self._last: Exposure | None = None
 
-    def expose(self, look: Look) -> Exposure | None:
+    def expose(self, look: CaptureRequest) -> Exposure | None:
         self.looks.append(look)
         if look.number == 1 and self.restart_cures:
             self._cure()
@@ -92,7 +92,7 @@ def pinhole_rays(pinhole: Intrinsics) -> np.ndarray:
 @cache
 def pictures(width: int, height: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return depth (H, W), unrectified colour (H, W, 3) and the rectified picture (H, W, 3)."""
-    calibration = Calibration()
+    calibration = D405Calibration()
     colour, depth = calibration.colour(width, height), calibration.depth(width, height)
     v, u = np.mgrid[0:height, 0:width].astype(float)
     pixels = np.stack([u, v], axis=-1).reshape(-1, 1, 2)

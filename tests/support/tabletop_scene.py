@@ -152,7 +152,9 @@ def d405(depth: np.ndarray, seed: int, noise_px: float = 0.08) -> np.ndarray:
 def frame_of(depth: np.ndarray, truth: np.ndarray | None = None) -> RgbdFrame:
     """Return a grey frame with that depth."""
     colour = np.full((*depth.shape, 3), 128, np.uint8)
-    return RgbdFrame(colour=colour, depth_m=depth, intrinsics=INTRINSICS, stamp_s=0.0, sequence=0, truth_mask=truth)
+    return RgbdFrame(
+        colour=colour, depth_m=depth, intrinsics=INTRINSICS, stamp_s=0.0, sequence=0, ground_truth_mask=truth
+    )
 
 
 def noisy_frame(objects: Sequence[Box | Cylinder], seed: int = 0, target: int = 0, **table: float) -> RgbdFrame:
@@ -163,5 +165,5 @@ def noisy_frame(objects: Sequence[Box | Cylinder], seed: int = 0, target: int = 
 
 def truth(frame: RgbdFrame) -> np.ndarray:
     """Return the truth mask of a frame that has one."""
-    assert frame.truth_mask is not None
-    return frame.truth_mask
+    assert frame.ground_truth_mask is not None
+    return frame.ground_truth_mask

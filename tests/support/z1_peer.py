@@ -27,7 +27,7 @@ from hal.z1_protocol.controller import (
     decode_command,
     encode_state,
 )
-from hal.z1_protocol.records import KD_SCALE, KP_SCALE, JointCommands, JointStates, WireError
+from hal.z1_protocol.records import KD_SCALE, KP_SCALE, JointCommands, JointStates, ProtocolError
 from hal.z1_protocol.states import MOVES, Fsm, granted
 
 _INERTIA = 0.2
@@ -94,7 +94,7 @@ class FakeController:
         try:
             command = decode_command(data)
             self._obey(command)
-        except WireError:
+        except ProtocolError:
             self.refused += 1
             return None
         self.received.append(command)

@@ -12,7 +12,7 @@ from models.diffusion.training.labels import GRIPPERS
 from models.factory import make_generator
 from models.samplers.antipodal import AntipodalSampler
 from z1_runtime.config import RuntimeConfig, load_config
-from z1_runtime.factory import make_decider
+from z1_runtime.factory import make_grasp_selector
 from z1_runtime.motion.limits import MotionLimits
 from z1_runtime.planning.planner_config import PlannerConfig
 
@@ -45,7 +45,7 @@ def test_the_parts_get_the_configuration_s_numbers():
     config = replace(RuntimeConfig(), speed=0.25, planner=PlannerConfig(lift_m=0.05))
     moved = z1.T_FLANGE_CAMERA.copy()
     moved[0, 3] += 0.01
-    decider = make_decider(config, moved)
+    decider = make_grasp_selector(config, moved)
     assert decider.config is config
     assert decider.planner.config.lift_m == 0.05
     assert decider.planner._limits.velocity == pytest.approx(MotionLimits.at_speed(0.25).velocity)
@@ -54,7 +54,7 @@ def test_the_parts_get_the_configuration_s_numbers():
 
 
 def test_planner_and_decider_share_one_model_of_the_arm():
-    decider = make_decider(RuntimeConfig())
+    decider = make_grasp_selector(RuntimeConfig())
     assert decider.planner._kinematics is decider.kinematics
 
 

@@ -20,7 +20,7 @@ from hal.base.clock import Clock
 from hal.base.transforms import pose_error
 from z1_runtime.calibration_session.board_search import BoardSearch, camera_model, is_still, still_frame
 from z1_runtime.geometry.kinematics import Kinematics
-from z1_runtime.visualization.rerun_logger import Inspector
+from z1_runtime.visualization.rerun_logger import RerunLogger
 
 _ROUNDS = 3
 _NEW_M, _NEW_RAD = 0.04, 0.15
@@ -68,7 +68,7 @@ class Capture:
         board: Board,
         folder: Path,
         T_flange_camera: np.ndarray = z1.T_FLANGE_CAMERA,
-        inspector: Inspector | None = None,
+        inspector: RerunLogger | None = None,
     ) -> None:
         self.taken: list[Taken] = []
         """Samples of the folder, those of earlier runs first."""
@@ -77,7 +77,7 @@ class Capture:
         self._T_flange_camera = T_flange_camera
         self._tried: list[np.ndarray] = []  # T_base_camera of every picture, the useless ones too
         self._kinematics = Kinematics()
-        self._inspector = inspector or Inspector()
+        self._inspector = inspector or RerunLogger()
 
     def open(self, date: str, truth: dict[str, Any] | None = None) -> int:
         """Make the folder, or take up what is in it; return how many usable samples it holds already.

@@ -21,7 +21,7 @@ from z1_runtime.collision.scene_collision import CollisionChecker, CollisionConf
 from z1_runtime.geometry.kinematics import Kinematics
 from z1_runtime.motion.trajectory import MotionLimits, joint_path
 from z1_runtime.perception.point_cloud import back_project, continuous_pixels, valid_pixels
-from z1_runtime.perception.self_filter import OwnGripper
+from z1_runtime.perception.self_filter import SelfFilter
 from z1_runtime.perception.table_plane import TableConfig, expected_table, fit_table
 from z1_runtime.types import JointTrajectory, Observation
 
@@ -93,7 +93,7 @@ def look_around(
         NoTableError: the table is not in view.
     """
     T_base_camera = kinematics.flange(q[: z1.N_ARM]) @ T_flange_camera
-    depth = OwnGripper().blanked(frame, float(q[-1]), T_flange_camera).depth_m
+    depth = SelfFilter().mask_gripper(frame, float(q[-1]), T_flange_camera).depth_m
     seen = valid_pixels(depth, _FARTHEST_SEEN_M) & continuous_pixels(depth)
     points = back_project(depth, frame.intrinsics, seen)
     # Fitted, not assumed: a mount that is off its drawing tilts the table, and its far end would be an obstacle
@@ -159,7 +159,7 @@ def find_viewpoints(
     """
     config = config or ViewpointConfig()
     rng = np.random.default_rng(seed)
-    hidden = OwnGripper().reach_m(intrinsics, config.jaw, T_flange_camera) > 0.0
+    hidden = SelfFilter().reach_m(intrinsics, config.jaw, T_flange_camera) > 0.0
     T_camera_pivot = inverse(T_flange_camera) @ z1.T_FLANGE_PIVOT
     refused = dict.fromkeys(("out of view", "out of reach", "collision"), 0)
     found: list[Viewpoint] = []

@@ -13,7 +13,7 @@ from hal.base.z1_shape import CAPSULES
 from z1_runtime.collision import self_collision
 from z1_runtime.collision.self_collision import MAY_MEET_SCENE, ArmPoses, Problem, first_arm_problem
 from z1_runtime.collision.voxel_grid import MAX_THRESHOLD_M, SceneIndex
-from z1_runtime.geometry.gripper_geometry import mover_pose
+from z1_runtime.geometry.gripper_geometry import moving_jaw_pose
 from z1_runtime.geometry.gripper_mesh import gripper_shape
 from z1_runtime.geometry.kinematics import Kinematics
 from z1_runtime.types import JointTrajectory, Observation, Plane
@@ -113,8 +113,8 @@ class CollisionChecker:
         T_base_camera = observation.T_base_camera
         self.table = plane_in_base(observation.table, T_base_camera)
         self.object_points = transform_points(T_base_camera, observation.object_points)
-        self.hidden_points = transform_points(T_base_camera, observation.hidden_points)
-        whole = np.concatenate([self._down_to_table(self.object_points), self.hidden_points])
+        self.occluded_points = transform_points(T_base_camera, observation.occluded_points)
+        whole = np.concatenate([self._down_to_table(self.object_points), self.occluded_points])
         self.object_index = SceneIndex(whole)
         scene = transform_points(T_base_camera, observation.scene_points)
         scene = scene[self.table.height_m(scene) > self.config.table_noise_m]
@@ -158,7 +158,7 @@ class CollisionChecker:
         config = self.config
         scene_m = config.scene_threshold_m if scene_threshold_m is None else scene_threshold_m
         object_m = config.object_threshold_m if object_threshold_m is None else object_threshold_m
-        T_base_movers = T_base_pivots @ mover_pose(jaws)
+        T_base_movers = T_base_pivots @ moving_jaw_pose(jaws)
         parts = ((T_base_pivots, self._shape.fixed), (T_base_movers, self._shape.mover))
         height = np.min([self._lowest(T, vertices) for T, vertices in parts], axis=0)
         clear = height >= config.table_margin_m
@@ -222,7 +222,7 @@ class CollisionChecker:
         return None
 
     def _heights(self, T_base_pivots: np.ndarray, jaws: np.ndarray) -> np.ndarray:
-        parts = ((T_base_pivots, self._shape.fixed), (T_base_pivots @ mover_pose(jaws), self._shape.mover))
+        parts = ((T_base_pivots, self._shape.fixed), (T_base_pivots @ moving_jaw_pose(jaws), self._shape.mover))
         return np.min([self._lowest(T, vertices) for T, vertices in parts], axis=0)
 
     def _lowest(self, T: np.ndarray, vertices: np.ndarray) -> np.ndarray:
@@ -242,7 +242,7 @@ class CollisionChecker:
 
     def _gripper_points(self, q: np.ndarray) -> np.ndarray:
         T_base_pivot = self._kinematics.pivot(q[: z1.N_ARM])
-        T_base_mover = T_base_pivot @ mover_pose(float(q[-1]))
+        T_base_mover = T_base_pivot @ moving_jaw_pose(float(q[-1]))
         return np.concatenate(
             [transform_points(T_base_pivot, self._shape.fixed), transform_points(T_base_mover, self._shape.mover)]
         )

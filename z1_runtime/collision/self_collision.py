@@ -10,7 +10,7 @@ from numba import njit
 from hal.base import z1
 from hal.base.z1_shape import CAPSULE_PAIRS, CAPSULES, GRIPPER_OBSTACLES, TABLE_LINKS
 from hal.servo.guard_kernels import segment_distance, squared_distance
-from z1_runtime.geometry.gripper_geometry import mover_pose
+from z1_runtime.geometry.gripper_geometry import moving_jaw_pose
 from z1_runtime.geometry.gripper_mesh import gripper_shape
 from z1_runtime.geometry.kinematics import Kinematics
 from z1_runtime.types import Plane
@@ -53,7 +53,7 @@ class ArmPoses:
             for c, capsule in enumerate(CAPSULES):
                 links[n, c] = poses[capsule.link]
             pivots[n] = poses["link06"] @ z1.T_FLANGE_PIVOT
-        return cls(links, pivots, pivots @ mover_pose(q[:, -1]))
+        return cls(links, pivots, pivots @ moving_jaw_pose(q[:, -1]))
 
 
 def first_arm_problem(poses: ArmPoses, table: Plane, link_margin_m: float) -> Problem | None:

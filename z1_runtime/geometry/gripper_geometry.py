@@ -66,7 +66,7 @@ class BeakConfig:
     """Least friction coefficient that must keep the object from being squeezed out; rubber on plastic has 0.5 to 1."""
 
 
-def mover_pose(jaw: float | np.ndarray) -> np.ndarray:
+def moving_jaw_pose(jaw: float | np.ndarray) -> np.ndarray:
     """Return T_pivot_mover (..., 4, 4) at mover angle `jaw` [rad]: a turn about the pivot's y axis."""
     c, s = np.cos(jaw), np.sin(jaw)
     T_pivot_mover = np.zeros((*np.shape(jaw), 4, 4))

@@ -8,7 +8,7 @@ import numpy as np
 
 from hal.base import z1
 from hal.base.errors import Z1Error
-from z1_runtime.geometry.gripper_geometry import BeakConfig, Lay, lay_around, mover_pose
+from z1_runtime.geometry.gripper_geometry import BeakConfig, Lay, lay_around, moving_jaw_pose
 
 _WIDTHS_M = np.arange(0.002, 0.120, 0.0005)
 
@@ -138,7 +138,7 @@ class BeakGripper:
             T_base_pivots=T_base_pivots,
             jaw_contact=-lay.contact,
             jaw_open=np.maximum(-lay.opened, z1.GRIPPER_OPEN),
-            T_base_touches=T_base_pivots @ mover_pose(-lay.turn)[:, None],
+            T_base_touches=T_base_pivots @ moving_jaw_pose(-lay.turn)[:, None],
             jaw_touch=-lay.pressed,
             setback_m=lay.setback_m,
             level=np.clip(1.0 - lay.squeeze_out / self._steepest, 0.0, 1.0),

@@ -6,7 +6,7 @@ import numpy as np
 
 from models.obb.mvbb import fit_obb, nearest_faces
 from models.types import GraspSet
-from z1_runtime.grasping.grasp_candidates import Candidates
+from z1_runtime.grasping.grasp_candidates import GraspCandidates
 from z1_runtime.types import Observation, Plane
 
 FEATURES = {
@@ -41,7 +41,7 @@ def seen_by_box(grasps: GraspSet, observation: Observation) -> tuple[np.ndarray,
 
 
 def measure(
-    candidates: Candidates,
+    candidates: GraspCandidates,
     *,
     approaches: np.ndarray,
     middle: np.ndarray,

@@ -18,7 +18,7 @@ _ELSEWHERE_M = 0.003
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Way:
+class GripperPlacement:
     """One candidate, one flip: all the motion needs to know."""
 
     T_base_pivot: np.ndarray
@@ -33,7 +33,7 @@ class Way:
     """Mover angle there [rad]."""
 
 
-class Candidates:
+class GraspCandidates:
     """All candidates in the base frame, fitted and pre-checked chunk by chunk, so that an early hit comes fast."""
 
     def __init__(
@@ -89,7 +89,7 @@ class Candidates:
         """Return (N,) whether a flip of each candidate hits nothing at the grasp."""
         return np.array([not isinstance(self.ways(rank), Problem) for rank in range(len(self))], dtype=bool)
 
-    def ways(self, rank: int) -> list[Way] | Problem:
+    def ways(self, rank: int) -> list[GripperPlacement] | Problem:
         """Return the flips of candidate `rank` that hit nothing at the grasp, or why there is none."""
         chunk, n = divmod(rank, self._chunk)
         if chunk not in self._chunks:
@@ -111,7 +111,7 @@ class Candidates:
             assert problem is not None
             return problem
         return [
-            Way(
+            GripperPlacement(
                 T_base_pivot=batch.T_base_pivots[n, flip],
                 T_base_grasp=T_base_grasp,
                 jaw_open=float(batch.jaw_open[n]),
@@ -159,7 +159,7 @@ class Candidates:
         widths = np.where(np.isfinite(fit.widths_m), fit.widths_m, self._fallback_width_m)
         middled = Ts.copy()
         middled[:, :3, 3] += fit.shifts_m[:, None] * Ts[:, :3, 1]
-        return *make_room(middled, widths, self._checker.hidden_points, beak.contact_depth_m), fit.fronts_m
+        return *make_room(middled, widths, self._checker.occluded_points, beak.contact_depth_m), fit.fronts_m
 
     def _along(self, Ts: np.ndarray, widths_m: np.ndarray, fronts_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return how far (n,) grasps move on along their approach, to where the object is as wide as it gets, and how

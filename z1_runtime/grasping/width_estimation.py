@@ -23,7 +23,7 @@ _STRIP_GAP_M = 0.008
 _HIDDEN_Z_M, _HIDDEN_Y_M = 0.020, 0.025
 
 
-class Fit(NamedTuple):
+class WidthEstimate(NamedTuple):
     """What the points say of N grasps; z is measured from the contacts' middle, not from the grasp's origin."""
 
     widths_m: np.ndarray
@@ -37,7 +37,7 @@ class Fit(NamedTuple):
 
 def fit_grasps(
     T_base_grasps: np.ndarray, widths_m: np.ndarray, points: np.ndarray, contact_depth_m: float, unseen_m: float = 0.0
-) -> Fit:
+) -> WidthEstimate:
     """Measure the object's `points` (M, 3) in the frames of grasps (N, 4, 4) with `widths_m` (N,), NaN = not known.
 
     Args:
@@ -48,7 +48,7 @@ def fit_grasps(
         unseen_m: how much farther out a contact is thought to be where no point is seen near it [m].
     """
     T, widths, cloud = (np.ascontiguousarray(array, dtype=np.float64) for array in (T_base_grasps, widths_m, points))
-    return Fit(*_fit(T, widths, cloud, contact_depth_m, unseen_m))
+    return WidthEstimate(*_fit(T, widths, cloud, contact_depth_m, unseen_m))
 
 
 def measure_support(

@@ -62,7 +62,7 @@ class MotionLimits:
                 if not 0.0 < getattr(self, name) < np.inf:
                     raise InvalidValueError(f"{name} is {getattr(self, name)}; it must be positive and finite.")
 
-    def hastened(self, factor: float) -> MotionLimits:
+    def scaled(self, factor: float) -> MotionLimits:
         """Return limits `factor` times as high, where the arm's own do not end that.
 
         Raises:

@@ -13,8 +13,7 @@ import numpy as np
 from hal.base.errors import InvalidValueError
 from hal.base.messages import RgbdFrame
 from hal.base.transforms import transform_points
-from models.detector.detector import YoloConfig
-from models.detector.detector import YoloDetector as ColourDetector
+from models.detector.detector import YoloConfig, YoloModel
 from models.types import Detection
 from models.weights_file import WeightsError
 from z1_runtime.perception.mask_refinement import lies_flat, trimmed
@@ -52,7 +51,7 @@ def mask_box(mask: np.ndarray) -> tuple[int, int, int, int]:
     return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
 
 
-class TruthDetector:
+class GroundTruthDetector:
     """The twin's own mask, for evaluation: it shows what the rest does when detection is perfect."""
 
     classes: tuple[str, ...] = ()
@@ -60,11 +59,11 @@ class TruthDetector:
 
     def detect(self, frame: RgbdFrame, T_base_camera: np.ndarray) -> list[Detection]:
         """Return the one object of the truth mask; see `Detector.detect`."""
-        if frame.truth_mask is None:
+        if frame.ground_truth_mask is None:
             raise PerceptionError("only the twin's frames carry a truth mask; use --detector tabletop.")
-        if not frame.truth_mask.any():
+        if not frame.ground_truth_mask.any():
             return []
-        mask = frame.truth_mask
+        mask = frame.ground_truth_mask
         return [Detection(label="object", confidence=1.0, box_px=mask_box(mask), mask=mask)]
 
 
@@ -178,8 +177,8 @@ class YoloDetector:
     """What YOLOv8 sees in the colour image, its masks held against the depth."""
 
     def __init__(self, config: YoloConfig | None = None) -> None:
-        """Load the network; errors as `models.detector.detector.YoloDetector`."""
-        self._detector = ColourDetector(config)
+        """Load the network; errors as `models.detector.detector.YoloModel`."""
+        self._detector = YoloModel(config)
         self.classes = self._detector.classes
         self.min_confidence = self._detector.config.min_confidence
         self.runtime = self._detector.runtime
@@ -208,7 +207,7 @@ _FAINT = 0.1
 
 _DETECTORS: dict[str, Callable[[YoloConfig], Detector]] = {
     "tabletop": lambda _: TabletopDetector(),
-    "truth": lambda _: TruthDetector(),
+    "truth": lambda _: GroundTruthDetector(),
     "yolo": YoloDetector,
 }
 DETECTORS = tuple(_DETECTORS)

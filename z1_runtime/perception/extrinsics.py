@@ -18,7 +18,7 @@ FOLDER_VARIABLE = "Z1_CALIBRATIONS"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Mount:
+class Extrinsics:
     """The hand-eye transform in force and where it is from."""
 
     T_flange_camera: np.ndarray
@@ -37,7 +37,7 @@ def results_folder(given: Path | None = None) -> Path:
     return Path(data) / "z1-grasp" / "calibrations"
 
 
-def find_mount(serial: str, file: Path | None = None, folder: Path | None = None) -> Mount:
+def find_extrinsics(serial: str, file: Path | None = None, folder: Path | None = None) -> Extrinsics:
     """Return the mount of the camera `serial`; whatever is doubtful about it is logged as a warning.
 
     Args:
@@ -56,12 +56,12 @@ def find_mount(serial: str, file: Path | None = None, folder: Path | None = None
         if file is None and error.code == "missing_result":
             return _nominal(serial, folder)
         raise ConfigError(str(error)) from error
-    return Mount(T_flange_camera=T_flange_camera, origin=_origin(found))
+    return Extrinsics(T_flange_camera=T_flange_camera, origin=_origin(found))
 
 
-def _nominal(serial: str, folder: Path) -> Mount:
+def _nominal(serial: str, folder: Path) -> Extrinsics:
     whose = f"of camera {serial}" if serial else "of this camera, which tells no serial number,"
-    return Mount(
+    return Extrinsics(
         T_flange_camera=z1.T_FLANGE_CAMERA,
         origin=f"the mount's drawing (no hand-eye calibration {whose} in {folder})",
     )

@@ -19,9 +19,9 @@ from hal.base import z1
 from hal.base.errors import InvalidValueError
 from hal.base.messages import RgbdFrame
 from hal.base.transforms import inverse, transform_points
-from z1_runtime.geometry.gripper_geometry import mover_pose
+from z1_runtime.geometry.gripper_geometry import moving_jaw_pose
 from z1_runtime.geometry.gripper_mesh import T_PIVOT_STATOR
-from z1_runtime.perception.self_filter import OwnGripper
+from z1_runtime.perception.self_filter import SelfFilter
 
 _SAMPLES = {"z1_GripperStator": 50_000, "z1_GripperMover": 30_000}
 _ROUNDS, _FIRST_M, _LAST_M, _NARROWING = 20, 0.012, 0.002, 0.75
@@ -33,7 +33,7 @@ _AHEAD_M = 0.4  # where objects are when they are looked at: there a mount's err
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class MountSight:
+class ExtrinsicsCheck:
     """When the mount that the jaws show is believed."""
 
     enabled: bool = True
@@ -48,7 +48,7 @@ class MountSight:
     """Root mean square distance of those from the meshes [m]; jaws of another make do not fit as closely."""
     points: int = 4000
     """Pixels that are laid onto the meshes."""
-    own: OwnGripper = field(default_factory=lambda: OwnGripper(margin_m=0.012))
+    own: SelfFilter = field(default_factory=lambda: SelfFilter(margin_m=0.012))
     """Which pixels may show the jaws."""
 
     def __post_init__(self) -> None:
@@ -64,7 +64,7 @@ class MountSight:
         if self.points < _FEWEST_PX:
             raise InvalidValueError(f"points is {self.points}; allowed is {_FEWEST_PX} or more.")
 
-    def correct(self, frame: RgbdFrame, jaw: float, T_flange_camera: np.ndarray) -> SeenMount | None:
+    def correct(self, frame: RgbdFrame, jaw: float, T_flange_camera: np.ndarray) -> ExtrinsicsEstimate | None:
         """Return the mount that the jaws show, where it is to be believed and another than the given one; else None.
 
         Args:
@@ -77,7 +77,7 @@ class MountSight:
             return None
         return seen if self.least_m < seen.moved_m < self.most_m else None
 
-    def see(self, frame: RgbdFrame, jaw: float, T_flange_camera: np.ndarray) -> SeenMount | None:
+    def see(self, frame: RgbdFrame, jaw: float, T_flange_camera: np.ndarray) -> ExtrinsicsEstimate | None:
         """Return the mount that lays the jaws' depth onto their meshes; None where too little of them is seen."""
         points = self._jaw_points(frame, jaw, T_flange_camera)
         if len(points) < _FEWEST_PX:
@@ -100,7 +100,7 @@ class MountSight:
             if within == _LAST_M and np.abs(step - np.eye(4)).max() < _STILL:
                 break
         moved = np.array([0.0, 0.0, _AHEAD_M])
-        return SeenMount(
+        return ExtrinsicsEstimate(
             T_flange_camera=T,
             moved_m=float(np.linalg.norm(transform_points(inverse(T_flange_camera) @ T, moved[None])[0] - moved)),
             share=float(near.mean()),
@@ -118,7 +118,7 @@ class MountSight:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class SeenMount:
+class ExtrinsicsEstimate:
     """What the jaws say of the mount."""
 
     T_flange_camera: np.ndarray
@@ -150,7 +150,7 @@ def _step(at: np.ndarray, normals: np.ndarray, offsets: np.ndarray) -> np.ndarra
 def _jaws(jaw: float) -> tuple[np.ndarray, np.ndarray]:
     """Return surface points (N, 3) [m] and outward normals (N, 3) of both jaws in the flange frame."""
     (fixed, fixed_normals), (mover, mover_normals) = (_sampled(name) for name in _SAMPLES)
-    T_stator, T_mover = z1.T_FLANGE_PIVOT @ T_PIVOT_STATOR, z1.T_FLANGE_PIVOT @ mover_pose(jaw)
+    T_stator, T_mover = z1.T_FLANGE_PIVOT @ T_PIVOT_STATOR, z1.T_FLANGE_PIVOT @ moving_jaw_pose(jaw)
     points = [transform_points(T_stator, fixed), transform_points(T_mover, mover)]
     return np.concatenate(points), np.concatenate(
         [fixed_normals @ T_stator[:3, :3].T, mover_normals @ T_mover[:3, :3].T]

@@ -15,7 +15,7 @@ _THIN_PX = 17  # narrower gaps are the stereo's own: holes, and the shadow besid
 _TOUCH_PX = 5
 
 
-def hidden_points(depth_m: np.ndarray, intrinsics: Intrinsics, solid: np.ndarray) -> np.ndarray:
+def occluded_points(depth_m: np.ndarray, intrinsics: Intrinsics, solid: np.ndarray) -> np.ndarray:
     """Return points (K, 3) in the camera frame [m] where the object may go on behind the gripper or a dark spot.
 
     They continue the object's depth into what was not measured, up to `REACH_M` from its border.

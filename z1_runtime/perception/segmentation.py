@@ -14,8 +14,8 @@ from hal.base.messages import RgbdFrame
 from models.detector.detector import best_of, labels_for
 from models.types import Detection
 from z1_runtime.perception.detectors import Detector
-from z1_runtime.perception.extrinsics_check import MountSight
-from z1_runtime.perception.occlusion import hidden_points
+from z1_runtime.perception.extrinsics_check import ExtrinsicsCheck
+from z1_runtime.perception.occlusion import occluded_points
 from z1_runtime.perception.point_cloud import (
     PerceptionError,
     back_project,
@@ -28,7 +28,7 @@ from z1_runtime.perception.point_cloud import (
     valid_pixels,
     voxel_downsample,
 )
-from z1_runtime.perception.self_filter import OwnGripper
+from z1_runtime.perception.self_filter import SelfFilter
 from z1_runtime.perception.table_plane import TableConfig, expected_table, fit_table
 from z1_runtime.types import Observation
 
@@ -76,8 +76,8 @@ class PerceptionConfig:
     min_points: int = 100
     """Fewest points of the object's cloud."""
     table: TableConfig = field(default_factory=TableConfig)
-    own: OwnGripper = field(default_factory=OwnGripper)
-    mount: MountSight = field(default_factory=MountSight)
+    own: SelfFilter = field(default_factory=SelfFilter)
+    mount: ExtrinsicsCheck = field(default_factory=ExtrinsicsCheck)
     """Whether the jaws in the picture may correct where the camera sits."""
 
     def __post_init__(self) -> None:
@@ -191,11 +191,11 @@ class Perception:
             # The table under a box-shaped crop is scene; what stands inside the crop is not.
             scene_points=points[continuous[seen] & ~(rim[seen] & above)],
             table=table.plane,
-            hidden_points=hidden_points(depth, frame.intrinsics, solid),
+            occluded_points=occluded_points(depth, frame.intrinsics, solid),
         )
 
     def _without_gripper(self, frame: RgbdFrame, jaw: float) -> RgbdFrame:
-        return self._config.own.blanked(frame, jaw, self._T_flange_camera)
+        return self._config.own.mask_gripper(frame, jaw, self._T_flange_camera)
 
     def _clean(self, points: np.ndarray, above: np.ndarray, continuous: np.ndarray) -> np.ndarray:
         """Return the object among the points of a crop, given which are above the table and which do not fly."""

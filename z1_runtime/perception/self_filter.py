@@ -11,14 +11,14 @@ from hal.base import z1
 from hal.base.errors import InvalidValueError
 from hal.base.messages import Intrinsics, RgbdFrame
 from hal.base.transforms import inverse, transform_points
-from z1_runtime.geometry.gripper_geometry import mover_pose
+from z1_runtime.geometry.gripper_geometry import moving_jaw_pose
 from z1_runtime.geometry.gripper_mesh import gripper_shape
 
 _IN_FRONT_M = 0.02  # nearer to the lens than this are only camera and bracket themselves
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class OwnGripper:
+class SelfFilter:
     """The robot's own jaws in the picture; what stands between or behind them is not theirs.
 
     The margin covers what is left of the calibration's error, the jaw's angle, and depth noise.
@@ -31,7 +31,7 @@ class OwnGripper:
         if not 0.0 < self.margin_m < 0.05:
             raise InvalidValueError(f"margin_m is {self.margin_m}; allowed is above 0 and below 0.05 m.")
 
-    def blanked(self, frame: RgbdFrame, jaw: float, T_flange_camera: np.ndarray = z1.T_FLANGE_CAMERA) -> RgbdFrame:
+    def mask_gripper(self, frame: RgbdFrame, jaw: float, T_flange_camera: np.ndarray = z1.T_FLANGE_CAMERA) -> RgbdFrame:
         """Return `frame` with the depth of the gripper, whose mover is at `jaw` [rad], set to "not measured"."""
         own = (frame.depth_m > 0.0) & (frame.depth_m <= self.reach_m(frame.intrinsics, jaw, T_flange_camera))
         return replace(frame, depth_m=np.where(own, 0.0, frame.depth_m))
@@ -45,7 +45,7 @@ class OwnGripper:
         points = np.concatenate(
             [
                 transform_points(T_camera_pivot, shape.fixed),
-                transform_points(T_camera_pivot @ mover_pose(jaw), shape.mover),
+                transform_points(T_camera_pivot @ moving_jaw_pose(jaw), shape.mover),
             ]
         )
         points = points[points[:, 2] > _IN_FRONT_M]

@@ -14,7 +14,7 @@ from hal.base.transforms import inverse
 from z1_runtime.collision.scene_collision import CollisionChecker
 from z1_runtime.collision.self_collision import Problem
 from z1_runtime.geometry.kinematics import IkFailure, Kinematics
-from z1_runtime.grasping.grasp_candidates import Way
+from z1_runtime.grasping.grasp_candidates import GripperPlacement
 from z1_runtime.motion.trajectory import MotionLimits, PathFailure, concatenate, gripper_move, joint_path, straight_move
 from z1_runtime.planning.planner_config import PlannerConfig
 from z1_runtime.types import JointTrajectory
@@ -27,7 +27,7 @@ _HOW_FAR = ("ik", "path", "table", "self", "object", "scene")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Motion:
+class PickMotion:
     """The legs of a pick, each beginning at rest where the one before it ends."""
 
     transfer: JointTrajectory
@@ -36,7 +36,7 @@ class Motion:
     lift: JointTrajectory
 
 
-class Refused(Z1Error):
+class CandidateRejected(Z1Error):
     """A way cannot be gone.
 
     Attributes:
@@ -48,7 +48,7 @@ class Refused(Z1Error):
         self.reason = reason
 
 
-class MotionPlanner:
+class PickMotionPlanner:
     """Plans the motion of one candidate after the other, all from the same start among the same surroundings."""
 
     def __init__(
@@ -67,16 +67,16 @@ class MotionPlanner:
         self._q_start = q_start
         self._config = config
         self._limits = limits
-        self._closing = limits.hastened(config.closing_haste)
+        self._closing = limits.scaled(config.closing_speed_scale)
         self._timer = timer
 
-    def first_motion(self, ways: list[Way]) -> tuple[Way, Motion]:
+    def first_motion(self, ways: list[GripperPlacement]) -> tuple[GripperPlacement, PickMotion]:
         """Return the first of `ways`, the flips of one grasp, that some branch of the joints can go.
 
         Raises:
-            Refused: none can; of all the reasons, that of the one which came furthest.
+            CandidateRejected: none can; of all the reasons, that of the one which came furthest.
         """
-        furthest: tuple[int, Refused] | None = None
+        furthest: tuple[int, CandidateRejected] | None = None
         for way in ways:
             for standoff_m in dict.fromkeys((self._config.standoff_m, self._config.short_standoff_m)):
                 T_pre = _shifted(way.T_base_pivot, -standoff_m * way.T_base_grasp[:3, 2])
@@ -88,7 +88,7 @@ class MotionPlanner:
                     try:
                         with self._timer("plan"):
                             return way, self._motion(way, T_pre, q_arm)
-                    except Refused as refusal:
+                    except CandidateRejected as refusal:
                         stage = _HOW_FAR.index(refusal.reason)
                         if furthest is None or stage > furthest[0]:
                             furthest = stage, refusal
@@ -97,13 +97,13 @@ class MotionPlanner:
         assert furthest is not None
         raise furthest[1]
 
-    def nearest(self, way: Way) -> Way | None:
+    def nearest(self, way: GripperPlacement) -> GripperPlacement | None:
         """Return `way` moved to the nearest pose the arm reaches, or None where the algebra reaches it as it is.
 
         The paper's regularised least squares; it ends within 2 mm and 1° of the pose.
 
         Raises:
-            Refused: nothing is that near.
+            CandidateRejected: nothing is that near.
         """
         with self._timer("ik"):
             if self._kinematics.solve(way.T_base_pivot):
@@ -111,12 +111,12 @@ class MotionPlanner:
             try:
                 result = self._kinematics.best(way.T_base_pivot)
             except IkFailure as failure:
-                raise Refused("ik", f"{failure} (least squares)") from failure
+                raise CandidateRejected("ik", f"{failure} (least squares)") from failure
             T_base_pivot = self._kinematics.pivot(result.q)
             turn = inverse(way.T_base_pivot) @ way.T_base_touch
             return replace(way, T_base_pivot=T_base_pivot, T_base_touch=T_base_pivot @ turn)
 
-    def _branches(self, T_pre: np.ndarray, way: Way) -> tuple[list[np.ndarray], Refused | None]:
+    def _branches(self, T_pre: np.ndarray, way: GripperPlacement) -> tuple[list[np.ndarray], CandidateRejected | None]:
         """Return pre-grasp joints (6,), nearest to home first, or which of the three poses is out of reach."""
         T_lifted = _shifted(way.T_base_pivot, np.array([0.0, 0.0, self._config.lift_m]))
         branches: list[np.ndarray] = []
@@ -124,11 +124,13 @@ class MotionPlanner:
             branches = self._kinematics.solve(T)
             if not branches:
                 x, y, z = T[:3, 3]
-                return [], Refused("ik", f"no joints reach the {name}, the pivot at ({x:.3f}, {y:.3f}, {z:.3f}) m.")
+                return [], CandidateRejected(
+                    "ik", f"no joints reach the {name}, the pivot at ({x:.3f}, {y:.3f}, {z:.3f}) m."
+                )
         branches.sort(key=lambda q: float(np.sum((q - z1.Q_HOME) ** 2)))
         return branches[: self._config.max_branches], None
 
-    def _motion(self, way: Way, T_pre: np.ndarray, q_arm: np.ndarray) -> Motion:
+    def _motion(self, way: GripperPlacement, T_pre: np.ndarray, q_arm: np.ndarray) -> PickMotion:
         checker, limits = self._checker, self._limits
         q_pre = np.append(q_arm, way.jaw_open)
         T_lifted = _shifted(way.T_base_touch, np.array([0.0, 0.0, self._config.lift_m]))
@@ -141,7 +143,7 @@ class MotionPlanner:
             close = concatenate([touch, gripper_move(touch.q[-1], z1.GRIPPER_CLOSED, self._closing)])
             lift = straight_move(self._kinematics, way.T_base_touch, T_lifted, close.q[-1], z1.GRIPPER_CLOSED, limits)
         except PathFailure as failure:
-            raise Refused("path", str(failure)) from failure
+            raise CandidateRejected("path", str(failure)) from failure
         _refuse(
             checker.check_trajectory(
                 approach,
@@ -153,7 +155,7 @@ class MotionPlanner:
         _refuse(checker.check_closing(close), "while closing, ")
         _refuse(checker.check_trajectory(lift, threshold_m=checker.config.scene_threshold_m), "while lifting, ")
         transfer = self._transfer(q_pre, T_pre)
-        return Motion(transfer=transfer, approach=approach, close=close, lift=lift)
+        return PickMotion(transfer=transfer, approach=approach, close=close, lift=lift)
 
     def _transfer(self, q_pre: np.ndarray, T_pre: np.ndarray) -> JointTrajectory:
         """Return the first free way to the pre-grasp: direct, over a raised pose, or by way of home."""
@@ -166,7 +168,7 @@ class MotionPlanner:
                 return transfer
             first = first or problem
         assert first is not None
-        raise Refused("path", f"every way to the pre-grasp is blocked; directly, {first.detail}")
+        raise CandidateRejected("path", f"every way to the pre-grasp is blocked; directly, {first.detail}")
 
     def _detours(self, q_pre: np.ndarray, T_pre: np.ndarray) -> Iterator[list[np.ndarray]]:
         yield []
@@ -179,7 +181,7 @@ class MotionPlanner:
 
 def _refuse(problem: Problem | None, when: str) -> None:
     if problem is not None:
-        raise Refused(problem.reason, when + problem.detail)
+        raise CandidateRejected(problem.reason, when + problem.detail)
 
 
 def _shifted(T: np.ndarray, by: np.ndarray) -> np.ndarray:

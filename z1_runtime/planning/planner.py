@@ -23,12 +23,12 @@ from z1_runtime.geometry.kinematics import Kinematics
 from z1_runtime.grasping import width_estimation
 from z1_runtime.grasping.beak_gripper import BeakGripper
 from z1_runtime.grasping.features import measure, seen_by_box
-from z1_runtime.grasping.grasp_candidates import Candidates, Way
+from z1_runtime.grasping.grasp_candidates import GraspCandidates, GripperPlacement
 from z1_runtime.grasping.ranking import Ranking
 from z1_runtime.motion.trajectory import MotionLimits
-from z1_runtime.planning.pick_motion import Motion, MotionPlanner, Refused, StageTimer
+from z1_runtime.planning.pick_motion import CandidateRejected, PickMotion, PickMotionPlanner, StageTimer
 from z1_runtime.planning.planner_config import PlannerConfig
-from z1_runtime.planning.reachability import AbilityRanking
+from z1_runtime.planning.reachability import ReachabilityRanker
 from z1_runtime.types import GraspPlan, IkMethod, Observation, Rejection
 
 
@@ -49,8 +49,8 @@ class NoPlanError(Z1Error, RuntimeError):
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Found:
     rank: int
-    way: Way
-    motion: Motion
+    way: GripperPlacement
+    motion: PickMotion
     ik_method: IkMethod
 
 
@@ -86,7 +86,7 @@ class GraspPlanner:
         """
         checker, candidates = self._laid_out(grasps, observation)
         middle = _standing(transform_points(observation.T_base_camera, middle), checker)
-        ability = AbilityRanking(self._kinematics, checker, candidates, self.config)
+        ability = ReachabilityRanker(self._kinematics, checker, candidates, self.config)
         head = ranking.head if ranking else None
         likely = head.probability(self._measured(grasps, observation, checker, candidates)) if head else None
         wanted = ranking.wanted(alignments, grasps.scores) if ranking else None
@@ -104,9 +104,9 @@ class GraspPlanner:
         """
         return self._measured(grasps, observation, *self._laid_out(grasps, observation))
 
-    def _laid_out(self, grasps: GraspSet, observation: Observation) -> tuple[CollisionChecker, Candidates]:
+    def _laid_out(self, grasps: GraspSet, observation: Observation) -> tuple[CollisionChecker, GraspCandidates]:
         checker = CollisionChecker(self._kinematics, observation, None, self.config.collision)
-        return checker, Candidates(
+        return checker, GraspCandidates(
             grasps,
             observation.T_base_camera,
             self.gripper,
@@ -116,7 +116,7 @@ class GraspPlanner:
         )
 
     def _measured(
-        self, grasps: GraspSet, observation: Observation, checker: CollisionChecker, candidates: Candidates
+        self, grasps: GraspSet, observation: Observation, checker: CollisionChecker, candidates: GraspCandidates
     ) -> np.ndarray:
         candidates.free()  # lays all of them out
         approaches = grasps.T_camera_grasps[:, :3, 2] @ observation.T_base_camera[:3, :3].T
@@ -149,10 +149,10 @@ class GraspPlanner:
         config = self.config
         with timer("collision"):
             checker = CollisionChecker(self._kinematics, observation, q_start, config.collision)
-            candidates = Candidates(
+            candidates = GraspCandidates(
                 ranked, observation.T_base_camera, self.gripper, checker, fallback_width_m=config.fallback_width_m
             )
-        motions = MotionPlanner(self._kinematics, checker, q_start, config=config, limits=self._limits, timer=timer)
+        motions = PickMotionPlanner(self._kinematics, checker, q_start, config=config, limits=self._limits, timer=timer)
         refused: dict[int, Rejection] = {}
         found = self._first_exact(candidates, motions, refused, timer)
         found = found or self._first_within_tolerance(candidates, motions, refused)
@@ -175,7 +175,7 @@ class GraspPlanner:
         )
 
     def _first_exact(
-        self, candidates: Candidates, motions: MotionPlanner, refused: dict[int, Rejection], timer: StageTimer
+        self, candidates: GraspCandidates, motions: PickMotionPlanner, refused: dict[int, Rejection], timer: StageTimer
     ) -> _Found | None:
         """Return the first candidate that passes with analytic joints; `refused` gets why those before did not."""
         tried = 0
@@ -189,7 +189,7 @@ class GraspPlanner:
                 return None
             try:
                 way, motion = motions.first_motion(ways)
-            except Refused as refusal:
+            except CandidateRejected as refusal:
                 refused[rank] = Rejection(rank=rank, reason=refusal.reason, detail=str(refusal))
                 tried += refusal.reason != "ik"  # those cost a fraction of a millisecond
                 continue
@@ -197,7 +197,7 @@ class GraspPlanner:
         return None
 
     def _first_within_tolerance(
-        self, candidates: Candidates, motions: MotionPlanner, refused: dict[int, Rejection]
+        self, candidates: GraspCandidates, motions: PickMotionPlanner, refused: dict[int, Rejection]
     ) -> _Found | None:
         """Return the first candidate refused for its joints that passes where least squares puts it, and take it off
         `refused`; write there what became of the others."""
@@ -212,7 +212,7 @@ class GraspPlanner:
                     if near is None:
                         continue
                     _, motion = motions.first_motion([near])
-                except Refused as refusal:
+                except CandidateRejected as refusal:
                     refused[rank] = Rejection(rank=rank, reason=refusal.reason, detail=str(refusal))
                     continue
                 del refused[rank]

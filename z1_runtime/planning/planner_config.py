@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from hal.base.errors import InvalidValueError
 from z1_runtime.collision.scene_collision import CollisionConfig
 from z1_runtime.geometry.gripper_geometry import BeakConfig
-from z1_runtime.planning.reachability_config import AbilityConfig
+from z1_runtime.planning.reachability_config import ReachabilityConfig
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -20,7 +20,7 @@ class PlannerConfig:
     """Tried where the arm cannot draw back that far [m]."""
     lift_m: float = 0.10
     """Straight up after closing [m]."""
-    closing_haste: float = 2.0
+    closing_speed_scale: float = 2.0
     """How much faster than the rest of the motion the jaws close: what leans falls while only one jaw touches it."""
     fallback_width_m: float = 0.06
     """Taken where neither the generator nor the cloud tells a width [m]."""
@@ -35,7 +35,7 @@ class PlannerConfig:
     """How far above the pre-grasp the detour leads, when the direct way is blocked [m]."""
     max_swing_rad: float = 1.2
     """A joint that turns further than this between pre-grasp and grasp, or grasp and lift, has changed its branch."""
-    ability: AbilityConfig = field(default_factory=AbilityConfig)
+    ability: ReachabilityConfig = field(default_factory=ReachabilityConfig)
     """What makes one grasp better than another for this arm and gripper."""
     beak: BeakConfig = field(default_factory=BeakConfig)
     """How the beak is laid around an object."""
@@ -48,8 +48,8 @@ class PlannerConfig:
                 "PlannerConfig wants 0 < short_standoff_m <= standoff_m, lift_m > 0 and max_tried >= 1; got "
                 f"{self.short_standoff_m}, {self.standoff_m}, {self.lift_m} and {self.max_tried}."
             )
-        if not 1.0 <= self.closing_haste <= 10.0:
-            raise InvalidValueError(f"closing_haste is {self.closing_haste}; allowed is 1 to 10.")
+        if not 1.0 <= self.closing_speed_scale <= 10.0:
+            raise InvalidValueError(f"closing_haste is {self.closing_speed_scale}; allowed is 1 to 10.")
         for name in ("max_least_squares", "max_branches", "raise_m", "fallback_width_m"):
             least = 1 if name == "max_branches" else 0
             if not least <= getattr(self, name) < float("inf"):

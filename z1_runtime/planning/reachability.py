@@ -15,7 +15,7 @@ from hal.base import z1
 from z1_runtime.collision.scene_collision import CollisionChecker
 from z1_runtime.collision.self_collision import Problem
 from z1_runtime.geometry.kinematics import Kinematics
-from z1_runtime.grasping.grasp_candidates import Candidates, Way
+from z1_runtime.grasping.grasp_candidates import GraspCandidates, GripperPlacement
 from z1_runtime.planning.planner_config import PlannerConfig
 
 _EASY_MARGIN_RAD = 0.25
@@ -24,11 +24,11 @@ _APPROACH_SHARES = np.array([1.0, 0.6, 0.25, 0.0])  # of the stand-off
 _WITHIN_REACH, _FREE, _REFUSED = 2.0, 1.0, 0.0
 
 
-class AbilityRanking:
+class ReachabilityRanker:
     """Scores candidates for one arm among the surroundings of one frame."""
 
     def __init__(
-        self, kinematics: Kinematics, checker: CollisionChecker, candidates: Candidates, config: PlannerConfig
+        self, kinematics: Kinematics, checker: CollisionChecker, candidates: GraspCandidates, config: PlannerConfig
     ) -> None:
         self._kinematics = kinematics
         self._checker = checker
@@ -90,7 +90,7 @@ class AbilityRanking:
             + config.box * np.clip(np.nan_to_num(alignments), 0.0, 1.0)
         )
 
-    def ease(self, way: Way) -> float:
+    def ease(self, way: GripperPlacement) -> float:
         """Return how easily the arm goes `way`, in (0, 1]; 0 if it cannot."""
         for standoff_m in dict.fromkeys((self._planner.standoff_m, self._planner.short_standoff_m)):
             ease = max((self._posture_ease(qs) for qs in self._chains(way, standoff_m)), default=0.0)
@@ -98,7 +98,7 @@ class AbilityRanking:
                 return ease
         return 0.0
 
-    def _chains(self, way: Way, standoff_m: float) -> Iterator[np.ndarray]:
+    def _chains(self, way: GripperPlacement, standoff_m: float) -> Iterator[np.ndarray]:
         """Yield arm joints (3, 6) before, at and after the grasp, on one branch each."""
         T_pre, T_lifted = way.T_base_pivot.copy(), way.T_base_touch.copy()
         T_pre[:3, 3] -= standoff_m * way.T_base_grasp[:3, 2]
@@ -125,7 +125,7 @@ class AbilityRanking:
         least = np.linalg.svd(self._kinematics.jacobian(qs[1]), compute_uv=False)[-1] / _EASY_SINGULAR_VALUE
         return float(np.clip(0.5 * min(margin, 1.0) + 0.5 * min(least, 1.0), 0.01, 1.0))
 
-    def _approach_is_free(self, way: Way, standoff_m: float) -> bool:
+    def _approach_is_free(self, way: GripperPlacement, standoff_m: float) -> bool:
         T = np.tile(way.T_base_pivot, (len(_APPROACH_SHARES), 1, 1))
         T[:, :3, 3] -= standoff_m * _APPROACH_SHARES[:, None] * way.T_base_grasp[:3, 2]
         return bool(self._checker.check_grippers(T, np.full(len(T), way.jaw_open)).free().all())

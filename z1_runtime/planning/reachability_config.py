@@ -8,7 +8,7 @@ from hal.base.errors import InvalidValueError
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class AbilityConfig:
+class ReachabilityConfig:
     """What counts for how much, and how many grasps the arm is asked about."""
 
     centring: float = 0.30

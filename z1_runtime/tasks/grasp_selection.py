@@ -18,7 +18,7 @@ from z1_runtime.config import RuntimeConfig, ranking_of
 from z1_runtime.geometry.kinematics import Kinematics
 from z1_runtime.grasping.ranking import Ranking
 from z1_runtime.perception import extrinsics_check
-from z1_runtime.perception.detectors import TruthDetector
+from z1_runtime.perception.detectors import GroundTruthDetector
 from z1_runtime.perception.segmentation import Perception, PerceptionError
 from z1_runtime.planning.planner import GraspPlanner, NoPlanError
 from z1_runtime.types import GraspPlan, Observation
@@ -43,7 +43,7 @@ class StageTimes:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Decision:
+class GraspSelection:
     """Everything between one frame and the motion it leads to."""
 
     observation: Observation
@@ -54,7 +54,7 @@ class Decision:
     """By stage: detect, cloud, generate, mvbb, rank, ik, collision, plan, and their total."""
 
 
-class Decider:
+class GraspSelector:
     """Sees, proposes, filters by the box, and plans.
 
     Args:
@@ -88,7 +88,7 @@ class Decider:
         self.T_flange_camera = T_flange_camera
         self._mount_doubted = False
 
-    def decide(self, frame: RgbdFrame, q: np.ndarray) -> Decision:
+    def decide(self, frame: RgbdFrame, q: np.ndarray) -> GraspSelection:
         """Turn one frame, taken at joint positions `q` (7,), into a plan.
 
         Raises:
@@ -101,7 +101,7 @@ class Decider:
         with times.stage("total"):
             observation = self.observe(frame, q, times)
             candidates, ranked, plan = self._choose(observation, q, times)
-        return Decision(
+        return GraspSelection(
             observation=observation, candidates=candidates, ranked=ranked, plan=plan, stage_ms=dict(times.ms)
         )
 
@@ -193,7 +193,7 @@ class Decider:
         q = np.append(z1.Q_HOME, self.config.jaw_home)
         T_base_camera = self.kinematics.flange(z1.Q_HOME) @ self.T_flange_camera
         frame = draw_can(T_base_camera)
-        (can,) = TruthDetector().detect(frame, T_base_camera)
+        (can,) = GroundTruthDetector().detect(frame, T_base_camera)
         with suppress(PerceptionError):  # who looks at colours sees no can in a black picture, but is warm then
             self.perception.detect(frame, T_base_camera, self.config.jaw_home)
         try:
@@ -229,5 +229,5 @@ def draw_can(T_base_camera: np.ndarray, radius_m: float = 0.03, height_m: float 
         intrinsics=intrinsics,
         stamp_s=0.0,
         sequence=0,
-        truth_mask=np.fmin(side, lid) < table,
+        ground_truth_mask=np.fmin(side, lid) < table,
     )

@@ -21,9 +21,9 @@ from z1_runtime.motion.executor import Executor
 from z1_runtime.motion.trajectory import MotionLimits, hold, joint_move
 from z1_runtime.perception.point_cloud import PerceptionError
 from z1_runtime.planning.planner import NoPlanError
-from z1_runtime.tasks.grasp_selection import Decider, Decision
+from z1_runtime.tasks.grasp_selection import GraspSelection, GraspSelector
 from z1_runtime.types import GraspPlan
-from z1_runtime.visualization.rerun_logger import Inspector
+from z1_runtime.visualization.rerun_logger import RerunLogger
 
 _LOG = logging.getLogger(__name__)
 
@@ -38,10 +38,10 @@ class Phase:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class PickRecord:
+class PickResult:
     """What happened, for reports."""
 
-    decision: Decision
+    decision: GraspSelection
     phases: tuple[Phase, ...]
     held: bool
     """The jaws still hold something after the lift, by the gripper's own angle and torque."""
@@ -56,7 +56,7 @@ class PickRecord:
         return dict(Counter(rejection.reason for rejection in self.decision.plan.rejections))
 
 
-class PickPipeline:
+class PickTask:
     """Does picks with connected devices whose lease is held.
 
     Args:
@@ -72,11 +72,11 @@ class PickPipeline:
     def __init__(
         self,
         *,
-        decider: Decider,
+        decider: GraspSelector,
         arm: ServoedArm,
         camera: Camera,
         clock: Clock,
-        inspector: Inspector,
+        inspector: RerunLogger,
         config: RuntimeConfig,
         on_phase: Callable[[Phase], None] = lambda _: None,
     ) -> None:
@@ -92,11 +92,11 @@ class PickPipeline:
         self._motion = MotionLimits.at_speed(config.speed)
         self._phases: list[Phase] = []
 
-    def pick(self) -> PickRecord:
+    def pick(self) -> PickResult:
         """Look, decide, and execute the grasp.
 
         Raises:
-            As `Decider.decide`; and `MotionError`, `HalError` when the arm does not follow.
+            As `GraspSelector.decide`; and `MotionError`, `HalError` when the arm does not follow.
         """
         self._phases.clear()
         with self._phase("home"):
@@ -109,7 +109,7 @@ class PickPipeline:
         self._show(decision)
         state = self._execute(decision.plan)
         jaw, torque = float(state.q[-1]), float(state.tau[-1])
-        return PickRecord(
+        return PickResult(
             decision=decision,
             phases=tuple(self._phases),
             held=jaw < self.config.jaw_empty and abs(torque) > self.config.held_torque_nm,
@@ -117,7 +117,7 @@ class PickPipeline:
             jaw_torque_nm=torque,
         )
 
-    def pick_until_held(self) -> PickRecord:
+    def pick_until_held(self) -> PickResult:
         """Pick, and while the jaws hold nothing pick again from the scene as it then is, `attempts` times in all.
 
         Returns the last pick that was executed: what a miss has pushed out of view or out of reach ends it too.
@@ -153,7 +153,7 @@ class PickPipeline:
             self.executor.execute(hold(plan.lift.q[-1], self.config.hold_s))
         return self.arm.read_state()
 
-    def _show(self, decision: Decision) -> None:
+    def _show(self, decision: GraspSelection) -> None:
         observation, ranked = decision.observation, decision.ranked
         self.inspector.log_observation(observation)
         self.inspector.log_box(ranked.box, ranked.faces, observation.T_base_camera)

@@ -12,13 +12,13 @@ from hal.base.arm import Arm
 from hal.base.camera import Camera
 from hal.base.errors import HalError
 from z1_runtime.geometry.kinematics import Kinematics
-from z1_runtime.visualization.rerun_logger import Inspector
+from z1_runtime.visualization.rerun_logger import RerunLogger
 
 _LOG = logging.getLogger(__name__)
 _PATIENCE_S = 1.0
 
 
-class FrameTap:
+class LiveView:
     """Hands frames to the inspector, with the camera's pose at that moment; few, since each costs the HAL a picture.
 
     For devices that live by the wall clock; in lock-step, waiting for a frame would move time.
@@ -35,7 +35,7 @@ class FrameTap:
         self,
         camera: Camera,
         arm: Arm,
-        inspector: Inspector,
+        inspector: RerunLogger,
         T_flange_camera: np.ndarray = z1.T_FLANGE_CAMERA,
         *,
         rate_hz: float = 4.0,
@@ -49,7 +49,7 @@ class FrameTap:
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="frame tap", daemon=True)
 
-    def __enter__(self) -> FrameTap:
+    def __enter__(self) -> LiveView:
         self._thread.start()
         return self
 

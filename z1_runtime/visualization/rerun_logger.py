@@ -22,7 +22,7 @@ _Job = tuple[float, str, tuple[Any, ...]]
 """Stamp [s], what to draw, and its arguments."""
 
 
-class Inspector:
+class RerunLogger:
     """Writes a recording to a file, a live view, both, or nowhere.
 
     Calls only queue: a worker draws. Frames wait in a short queue of their own and are drawn last, so under load

@@ -23,8 +23,8 @@ from hal.z1_protocol.controller import (
     decode_state,
     encode_command,
 )
-from hal.z1_protocol.link import Link
-from hal.z1_protocol.records import JointCommands, WireError
+from hal.z1_protocol.link import DatagramLink
+from hal.z1_protocol.records import JointCommands, ProtocolError
 from hal.z1_protocol.states import Fsm, granted
 
 ANSWER_MAX_AGE_S = 0.1
@@ -68,7 +68,7 @@ class Z1Client:
         clock: what time it is.
     """
 
-    def __init__(self, link: Link, clock: Clock) -> None:
+    def __init__(self, link: DatagramLink, clock: Clock) -> None:
         self.link = link
         self.clock = clock
         self.command = CommandBuffer()
@@ -168,7 +168,7 @@ class Z1Client:
         else:
             try:
                 state = decode_state(data)
-            except WireError as error:
+            except ProtocolError as error:
                 self.counts.refused += 1
                 self.last_refusal = str(error)[:_LAST_REFUSAL_CHARS]
                 return False

@@ -12,7 +12,7 @@ from hal.base.clock import Clock, WallClock
 from hal.base.errors import CommandRejectedError, NotConnectedError
 from hal.servo.limits import ServoLimits
 from hal.z1_protocol.controller import ControllerState
-from hal.z1_protocol.link import Link, UdpLink
+from hal.z1_protocol.link import DatagramLink, UdpLink
 from hal.z1_protocol.states import Fsm
 
 _IDLE_WAIT_S = 0.02
@@ -40,7 +40,7 @@ class Z1Session:
         config: Z1ArmConfig | None = None,
         *,
         limits: ServoLimits | None = None,
-        link: Link | None = None,
+        link: DatagramLink | None = None,
     ) -> None:
         self.clock = clock or WallClock()
         self.config = config or Z1ArmConfig()

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from hal.base import d405
-from hal.base.d405 import Calibration
+from hal.base.d405 import D405Calibration
 from hal.base.messages import Intrinsics
 from hal.compat.realsense.library import native as rs
 
@@ -51,7 +51,7 @@ _OPTIONS = {
 """Lowest, highest, default, step. Exposure, gain and auto-exposure change the twin's pictures; the rest are kept."""
 
 
-def describe(handle, serial: str, calibration: Calibration):
+def describe(handle, serial: str, calibration: D405Calibration):
     """Give a `software_device` all that a D405 tells of itself; return its sensor."""
     sensor = handle.add_sensor(d405.SENSOR)
     _register_identity(handle, serial)
@@ -89,7 +89,7 @@ def _add_options(sensor) -> None:
     sensor.add_read_only_option(rs.option.stereo_baseline, 1e3 * d405.BASELINE_M)  # librealsense: in millimetres
 
 
-def _add_profiles(sensor, calibration: Calibration) -> None:
+def _add_profiles(sensor, calibration: D405Calibration) -> None:
     """Add every profile of the D405; a request that leaves something open takes the first that fits."""
     added: dict[tuple, list] = {key: [] for key in FORMATS}
     for width, height in d405.MIN_Z_M:
@@ -116,7 +116,7 @@ def _optics(pinhole: Intrinsics, model, coeffs: tuple[float, ...]):
     return optics
 
 
-def _register_extrinsics(added: dict[tuple, list], calibration: Calibration) -> None:
+def _register_extrinsics(added: dict[tuple, list], calibration: D405Calibration) -> None:
     first = added[rs.stream.depth, 0][0]
     for (stream, index), profiles in added.items():
         pose = rs.extrinsics()  # of the depth axes seen from the stream's

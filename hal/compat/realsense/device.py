@@ -12,7 +12,7 @@ import numpy as np
 
 from hal.base import d405
 from hal.base.clock import unix_offset_s
-from hal.base.d405 import Exposure, FrameSource, Look
+from hal.base.d405 import CaptureRequest, Exposure, FrameSource
 from hal.compat.realsense.description import FORMATS, describe
 from hal.compat.realsense.library import native as rs
 
@@ -137,14 +137,14 @@ class TwinDevice:
     def _active(self) -> list:
         return [profile.as_video_stream_profile() for profile in self._sensor.get_active_streams()]
 
-    def _look(self, number: int, profiles: list) -> Look:
+    def _look(self, number: int, profiles: list) -> CaptureRequest:
         wanted = {(p.stream_type(), p.stream_index()) for p in profiles}
         automatic = bool(self._sensor.get_option(rs.option.enable_auto_exposure))
         brightness = 1.0
         if not automatic:
             brightness = self._sensor.get_option(rs.option.exposure) / d405.EXPOSURE_US[-1]
             brightness *= self._sensor.get_option(rs.option.gain) / d405.GAIN[-1]
-        return Look(
+        return CaptureRequest(
             number=number,
             width=profiles[0].width(),
             height=profiles[0].height(),

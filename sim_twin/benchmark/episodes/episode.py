@@ -16,22 +16,22 @@ from sim_twin.benchmark.episodes.occlusion import occlude
 from sim_twin.benchmark.episodes.recordings import Recordings, record
 from sim_twin.benchmark.episodes.rows import Attempt, Row, make_row
 from sim_twin.benchmark.episodes.scenarios import Scenario
-from sim_twin.benchmark.episodes.seen import Seen
+from sim_twin.benchmark.episodes.seen import SharedObservation
 from sim_twin.benchmark.episodes.trial import RETRIED, Mode, Outcome, Robot, look
 from z1_runtime.motion.executor import MotionError
 from z1_runtime.perception.point_cloud import PerceptionError
 from z1_runtime.planning.planner import NoPlanError
-from z1_runtime.tasks.grasp_selection import Decider, StageTimes
+from z1_runtime.tasks.grasp_selection import GraspSelector, StageTimes
 from z1_runtime.types import Rejection
 
-MakeDecider = Callable[[Scenario, int], Decider]
+MakeDecider = Callable[[Scenario, int], GraspSelector]
 """Returns the runtime's decider for a scenario, with the generator's seed set to the second argument."""
 
 
 def run_scenario(
     scenario: Scenario,
     methods: Sequence[Method],
-    make_decider: MakeDecider,
+    make_grasp_selector: MakeDecider,
     *,
     top_k: int = 1,
     recordings: Recordings | None = None,
@@ -41,24 +41,27 @@ def run_scenario(
     Args:
         scenario: what stands where.
         methods: how candidates are ordered.
-        make_decider: called once for each attempt.
+        make_grasp_selector: called once for each attempt.
         top_k: candidates that may be executed; after a failure the scene is looked at again, as it then is.
         recordings: which episodes are written for Rerun too.
     """
-    decider = make_decider(scenario, scenario.draw_seed)
+    decider = make_grasp_selector(scenario, scenario.draw_seed)
     seen = _first_look(scenario, decider)
     if isinstance(seen, Attempt):
         return [make_row(scenario, method.name, [seen], top_k=top_k) for method in methods]
-    return [_run_method(scenario, method, make_decider, seen, top_k=top_k, recordings=recordings) for method in methods]
+    return [
+        _run_method(scenario, method, make_grasp_selector, seen, top_k=top_k, recordings=recordings)
+        for method in methods
+    ]
 
 
-def record_scenario(scenario: Scenario, method: Method, make_decider: MakeDecider, folder: Path) -> Path | None:
+def record_scenario(scenario: Scenario, method: Method, make_grasp_selector: MakeDecider, folder: Path) -> Path | None:
     """Write what `method` sees, ranks and chooses at its first look as <scenario>-<method>.rrd in `folder`.
 
     Returns:
         The file, or None where nothing is seen.
     """
-    decider = make_decider(scenario, scenario.draw_seed)
+    decider = make_grasp_selector(scenario, scenario.draw_seed)
     seen = _first_look(scenario, decider)
     if isinstance(seen, Attempt):
         return None
@@ -70,16 +73,16 @@ def recording_name(scenario: Scenario, method: Method) -> str:
     return f"{scenario.key}-{file_name(method.name)}.rrd"
 
 
-def _first_look(scenario: Scenario, decider: Decider) -> Seen | Attempt:
+def _first_look(scenario: Scenario, decider: GraspSelector) -> SharedObservation | Attempt:
     """Return what is seen from home, or the attempt that ended with the look."""
     frame, q = look(scenario.scene())
     return _see(scenario, decider, frame, q)
 
 
-def _see(scenario: Scenario, decider: Decider, frame: RgbdFrame, q: np.ndarray) -> Seen | Attempt:
+def _see(scenario: Scenario, decider: GraspSelector, frame: RgbdFrame, q: np.ndarray) -> SharedObservation | Attempt:
     times = StageTimes()
     try:
-        return Seen.by(decider, occlude(frame, scenario.occlusion, scenario.draw_seed), q, times)
+        return SharedObservation.by(decider, occlude(frame, scenario.occlusion, scenario.draw_seed), q, times)
     except PerceptionError as error:
         return Attempt(outcome=Outcome(mode=Mode.NO_DETECTION, detail=str(error)), times=times)
     except ValueError as error:
@@ -91,18 +94,18 @@ def _see(scenario: Scenario, decider: Decider, frame: RgbdFrame, q: np.ndarray) 
 def _run_method(
     scenario: Scenario,
     method: Method,
-    make_decider: MakeDecider,
-    seen: Seen,
+    make_grasp_selector: MakeDecider,
+    seen: SharedObservation,
     *,
     top_k: int,
     recordings: Recordings | None,
 ) -> Row:
-    decider = make_decider(scenario, scenario.draw_seed)
+    decider = make_grasp_selector(scenario, scenario.draw_seed)
     first = _decide(method, decider, seen)
     attempts, given_up, qpos = [first], "", None
     if first.plan is not None:
         with Robot(scenario.scene(), decider.kinematics, decider.config.speed) as robot:
-            attempts, given_up = _act(scenario, method, make_decider, robot, first, top_k=top_k)
+            attempts, given_up = _act(scenario, method, make_grasp_selector, robot, first, top_k=top_k)
             qpos = robot.world.data.qpos.copy()
     row = make_row(scenario, method.name, attempts, top_k=top_k, given_up=given_up, qpos=qpos)
     if recordings is not None and recordings.wants(success=row["success"]):
@@ -111,7 +114,7 @@ def _run_method(
 
 
 def _act(
-    scenario: Scenario, method: Method, make_decider: MakeDecider, robot: Robot, first: Attempt, *, top_k: int
+    scenario: Scenario, method: Method, make_grasp_selector: MakeDecider, robot: Robot, first: Attempt, *, top_k: int
 ) -> tuple[list[Attempt], str]:
     """Execute `first` and, after a failure, what is decided on another look; return all attempts and why it was left
     at them."""
@@ -123,7 +126,7 @@ def _act(
         attempts.append(replace(attempt, outcome=outcome))
         if outcome.mode not in RETRIED or len(attempts) == top_k:
             return attempts, ""
-        decider = make_decider(scenario, scenario.draw_seed + len(attempts))
+        decider = make_grasp_selector(scenario, scenario.draw_seed + len(attempts))
         try:
             robot.withdraw(attempt.plan, outcome, decider.config.jaw_home)
             if len(attempts) == 1:
@@ -136,7 +139,7 @@ def _act(
             return attempts, f"{attempt.ended.mode.value}: {attempt.ended.detail}"
 
 
-def _decide(method: Method, decider: Decider, seen: Seen) -> Attempt:
+def _decide(method: Method, decider: GraspSelector, seen: SharedObservation) -> Attempt:
     """Return the attempt that `method` would make; without a plan where there is none."""
     times = StageTimes()
     times.ms |= seen.times.ms
@@ -153,7 +156,7 @@ def _decide(method: Method, decider: Decider, seen: Seen) -> Attempt:
     return replace(attempt, features=_features(attempt, decider))
 
 
-def _features(attempt: Attempt, decider: Decider) -> np.ndarray | None:
+def _features(attempt: Attempt, decider: GraspSelector) -> np.ndarray | None:
     """Return what a scoring head would go by (see `Attempt.features`), where something was ranked."""
     if not attempt.ranked or attempt.seen is None:
         return None

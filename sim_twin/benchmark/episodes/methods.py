@@ -11,9 +11,9 @@ import numpy as np
 from hal.base.errors import InvalidValueError
 from models.obb.mvbb import FitMethod, RankedGrasps, fit_obb, rank_by_score, rank_grasps
 from models.types import GraspSet
-from sim_twin.benchmark.episodes.seen import Seen
+from sim_twin.benchmark.episodes.seen import SharedObservation
 from z1_runtime.grasping.ranking import Ranking, ScoringHead, load_scoring
-from z1_runtime.tasks.grasp_selection import Decider, StageTimes
+from z1_runtime.tasks.grasp_selection import GraspSelector, StageTimes
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -54,7 +54,9 @@ class Method:
         }
         return replace(configured, **{name: value for name, value in own.items() if value is not None})
 
-    def order(self, seen: Seen, decider: Decider, times: StageTimes) -> tuple[RankedGrasps, np.ndarray]:
+    def order(
+        self, seen: SharedObservation, decider: GraspSelector, times: StageTimes
+    ) -> tuple[RankedGrasps, np.ndarray]:
         """Return the candidates in the order to try them, and which (M,) were left before the ranking.
 
         The ranking's own indices count in those that were left.
@@ -74,7 +76,7 @@ class Method:
         with times.stage("rank"):
             return self._rank(seen.candidates[left], seen, decider), left
 
-    def _rank(self, candidates: GraspSet, seen: Seen, decider: Decider) -> RankedGrasps:
+    def _rank(self, candidates: GraspSet, seen: SharedObservation, decider: GraspSelector) -> RankedGrasps:
         if self.rank_by == "full":
             return decider.rank(candidates, seen.observation, self.ranking(decider.ranking))
         if self.rank_by == "score":
@@ -82,7 +84,9 @@ class Method:
         return _rank_by_box(candidates, seen, decider, self.ranking(Ranking()))
 
 
-def _rank_by_box(candidates: GraspSet, seen: Seen, decider: Decider, ranking: Ranking) -> RankedGrasps:
+def _rank_by_box(
+    candidates: GraspSet, seen: SharedObservation, decider: GraspSelector, ranking: Ranking
+) -> RankedGrasps:
     """Return the paper's order, or with a head the head's; what is below a threshold comes last."""
     observation = seen.observation
     box = fit_obb(observation.object_points, ranking.box_method, up=observation.T_base_camera[2, :3])

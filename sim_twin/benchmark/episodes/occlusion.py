@@ -24,18 +24,18 @@ def occlude(frame: RgbdFrame, share: float, seed: int) -> RgbdFrame:
     """
     if share == 0.0:
         return frame
-    if frame.truth_mask is None:
+    if frame.ground_truth_mask is None:
         raise InvalidValueError("only the twin's frames say where the object is; nothing else can be occluded.")
-    if not frame.truth_mask.any():
+    if not frame.ground_truth_mask.any():
         return frame
     angle = np.random.default_rng(seed).uniform(0.0, 2.0 * np.pi)
-    v, u = np.indices(frame.truth_mask.shape)
+    v, u = np.indices(frame.ground_truth_mask.shape)
     along = np.cos(angle) * u + np.sin(angle) * v
-    rows, columns = np.nonzero(frame.truth_mask)
+    rows, columns = np.nonzero(frame.ground_truth_mask)
     edge = np.quantile(along[rows, columns], 1.0 - share)
     card = along > edge
     card &= (u >= columns.min() - _MARGIN_PX) & (u <= columns.max() + _MARGIN_PX)
     card &= (v >= rows.min() - _MARGIN_PX) & (v <= rows.max() + _MARGIN_PX)
     colour, depth = frame.colour.copy(), frame.depth_m.copy()
     colour[card], depth[card] = _CARD_RGB, 0.0
-    return replace(frame, colour=colour, depth_m=depth, truth_mask=frame.truth_mask & ~card)
+    return replace(frame, colour=colour, depth_m=depth, ground_truth_mask=frame.ground_truth_mask & ~card)

@@ -8,7 +8,7 @@ from typing import Literal
 
 from hal.base.errors import InvalidValueError
 from sim_twin.benchmark.episodes.rows import Attempt
-from z1_runtime.visualization.rerun_logger import Inspector
+from z1_runtime.visualization.rerun_logger import RerunLogger
 
 _CLOSE_S = 60.0
 
@@ -34,7 +34,7 @@ def record(path: Path, attempt: Attempt) -> Path:
     if attempt.seen is None:
         raise InvalidValueError(f"an attempt in which nothing was seen cannot be recorded as {path}.")
     observation, ranked = attempt.seen.observation, attempt.ranked
-    inspector = Inspector(path)
+    inspector = RerunLogger(path)
     inspector.log_observation(observation)
     if ranked is not None:
         inspector.log_box(ranked.box, ranked.faces, observation.T_base_camera)

@@ -13,7 +13,7 @@ import numpy as np
 
 from models.obb.mvbb import RankedGrasps
 from sim_twin.benchmark.episodes.scenarios import Scenario
-from sim_twin.benchmark.episodes.seen import Seen
+from sim_twin.benchmark.episodes.seen import SharedObservation
 from sim_twin.benchmark.episodes.targeting import overlap
 from sim_twin.benchmark.episodes.trial import Mode, Outcome
 from z1_runtime.grasping.features import FEATURES
@@ -34,7 +34,7 @@ class Attempt:
     times: StageTimes
     outcome: Outcome | None = None
     """None while it has a plan that was not executed."""
-    seen: Seen | None = None
+    seen: SharedObservation | None = None
     ranked: RankedGrasps | None = None
     left: np.ndarray | None = None
     """(M,) candidates left before the ranking, whose indices count in these."""
@@ -102,10 +102,10 @@ def _version() -> str:
     return version("z1-grasp")
 
 
-def _of_look(seen: Seen | None) -> Row:
+def _of_look(seen: SharedObservation | None) -> Row:
     if seen is None:
         return {}
-    detection, truth = seen.observation.detection, seen.frame.truth_mask
+    detection, truth = seen.observation.detection, seen.frame.ground_truth_mask
     return {
         "n_object_points": len(seen.observation.object_points),
         "n_candidates": len(seen.candidates),

@@ -22,7 +22,7 @@ from sim_twin.benchmark.episodes.targeting import aim
 from z1_runtime.config import RuntimeConfig
 
 if TYPE_CHECKING:
-    from z1_runtime.tasks.grasp_selection import Decider
+    from z1_runtime.tasks.grasp_selection import GraspSelector
 
 T = TypeVar("T")
 
@@ -65,8 +65,8 @@ def run_task(task: Task) -> list[Row]:
         logging.ERROR
     )  # a camera off its mount is what is tried here
 
-    def decider(scenario: Scenario, seed: int) -> Decider:
-        return make_decider(task.config, scenario, seed)
+    def decider(scenario: Scenario, seed: int) -> GraspSelector:
+        return make_grasp_selector(task.config, scenario, seed)
 
     return run_scenario(task.scenario, task.methods, decider, top_k=task.top_k, recordings=task.recordings)
 
@@ -122,17 +122,17 @@ def one_thread() -> None:
     cv2.setNumThreads(1)
 
 
-def make_decider(config: RuntimeConfig, scenario: Scenario, seed: int) -> Decider:
+def make_grasp_selector(config: RuntimeConfig, scenario: Scenario, seed: int) -> GraspSelector:
     """Return the runtime's decider under `config`, told which object `scenario` means, with the generator's `seed`."""
     from z1_runtime.perception.segmentation import Perception
-    from z1_runtime.tasks.grasp_selection import Decider
+    from z1_runtime.tasks.grasp_selection import GraspSelector
 
     base = _assembled(replace(config, seed=0))
     config, detector = aim(replace(config, seed=seed), base.perception.detector, scenario)
     perception = base.perception
     if detector is not perception.detector:
         perception = Perception(config.perception, detector, base.T_flange_camera)
-    return Decider(
+    return GraspSelector(
         kinematics=base.kinematics,
         perception=perception,
         generator=base.generator,
@@ -143,9 +143,9 @@ def make_decider(config: RuntimeConfig, scenario: Scenario, seed: int) -> Decide
 
 
 @cache
-def _assembled(config: RuntimeConfig) -> Decider:
-    from z1_runtime.factory import make_decider
+def _assembled(config: RuntimeConfig) -> GraspSelector:
+    from z1_runtime.factory import make_grasp_selector
 
-    decider = make_decider(config)
+    decider = make_grasp_selector(config)
     decider.warm_up()
     return decider

@@ -7,12 +7,12 @@ import numpy as np
 from hal.base.messages import RgbdFrame
 from models.types import GraspSet
 from z1_runtime.collision.scene_collision import CollisionChecker
-from z1_runtime.grasping.grasp_candidates import Candidates
-from z1_runtime.tasks.grasp_selection import Decider, StageTimes
+from z1_runtime.grasping.grasp_candidates import GraspCandidates
+from z1_runtime.tasks.grasp_selection import GraspSelector, StageTimes
 from z1_runtime.types import Observation
 
 
-class Seen:
+class SharedObservation:
     """A frame, what perception made of it, and what the generator proposed.
 
     Args:
@@ -33,7 +33,7 @@ class Seen:
         self._filter_times = StageTimes()
 
     @classmethod
-    def by(cls, decider: Decider, frame: RgbdFrame, q: np.ndarray, times: StageTimes) -> Seen:
+    def by(cls, decider: GraspSelector, frame: RgbdFrame, q: np.ndarray, times: StageTimes) -> SharedObservation:
         """Return what `decider` sees in `frame`, taken at joints `q` (7,), and proposes for it; `times` gets the time.
 
         Raises:
@@ -45,7 +45,7 @@ class Seen:
             candidates = decider.propose(observation)
         return cls(frame, q, observation, candidates, times)
 
-    def free(self, decider: Decider, times: StageTimes) -> np.ndarray:
+    def free(self, decider: GraspSelector, times: StageTimes) -> np.ndarray:
         """Return (N,) which candidates the beak can be laid around without hitting a point that was seen.
 
         It is computed for the first method that asks, and its time is told to each: `times` gets the stage `filter`.
@@ -54,7 +54,7 @@ class Seen:
             with self._filter_times.stage("filter"):
                 planner = decider.planner
                 checker = CollisionChecker(decider.kinematics, self.observation, self.q, planner.config.collision)
-                self._free = Candidates(
+                self._free = GraspCandidates(
                     self.candidates,
                     self.observation.T_base_camera,
                     planner.gripper,

@@ -43,10 +43,10 @@ class PointedDetector:
 
     def detect(self, frame: RgbdFrame, T_base_camera: np.ndarray) -> list[Detection]:
         """Return that one, or nothing if none touches it; see `z1_runtime.perception.detectors.Detector.detect`."""
-        if frame.truth_mask is None:
+        if frame.ground_truth_mask is None:
             raise InvalidValueError("only the twin's frames say which object is meant.")
         found = self._detector.detect(frame, T_base_camera)
-        overlaps = [overlap(detection, frame.truth_mask) for detection in found]
+        overlaps = [overlap(detection, frame.ground_truth_mask) for detection in found]
         best = int(np.argmax(overlaps)) if found else -1
         return [found[best]] if found and overlaps[best] > 0.0 else []
 

@@ -24,11 +24,11 @@ from z1_runtime.geometry.gripper_geometry import BeakConfig
 from z1_runtime.geometry.kinematics import Kinematics
 from z1_runtime.grasping import width_estimation
 from z1_runtime.grasping.beak_gripper import BeakGripper
-from z1_runtime.grasping.grasp_candidates import Candidates, Way
+from z1_runtime.grasping.grasp_candidates import GraspCandidates, GripperPlacement
 from z1_runtime.motion.trajectory import MotionLimits
-from z1_runtime.planning.pick_motion import MotionPlanner
+from z1_runtime.planning.pick_motion import PickMotionPlanner
 from z1_runtime.planning.planner_config import PlannerConfig
-from z1_runtime.planning.reachability import AbilityRanking
+from z1_runtime.planning.reachability import ReachabilityRanker
 from z1_runtime.types import GraspPlan, Observation, Plane
 
 EXACT_PLANNER = PlannerConfig(
@@ -58,7 +58,7 @@ _A_COPY = 0.95
 class Option:
     """One grasp, one flip, that the arm can go."""
 
-    way: Way
+    way: GripperPlacement
     width_m: float
     jaw_contact: float
     """Mover angle at which it is touched [rad]."""
@@ -114,7 +114,7 @@ class Options:
         self._hope *= 1.0 - alike
 
 
-def _traits(way: Way) -> np.ndarray:
+def _traits(way: GripperPlacement) -> np.ndarray:
     """Return what makes a way another: approach, the jaws' axis, and where the pads press (9,)."""
     T = way.T_base_grasp
     return np.concatenate([T[:3, 2], way.T_base_pivot[:3, 1], T[:3, 3]])
@@ -140,7 +140,7 @@ class TrueScene:
         self._gripper = BeakGripper(planner.beak)
         q_home = np.append(z1.Q_HOME, GRIPPER_START_RAD)
         self._checker = CollisionChecker(kinematics, self._observation(scene), None, planner.collision)
-        self._motions = MotionPlanner(
+        self._motions = PickMotionPlanner(
             kinematics,
             self._checker,
             q_home,
@@ -153,7 +153,7 @@ class TrueScene:
         """Return the ways that hit nothing and that the arm can go, of the grasps of `sweep`."""
         planner = self._planner
         grasps = sweep_grasps(self._surface, self._T_base_object, planner.beak.contact_depth_m, sweep)
-        candidates = Candidates(
+        candidates = GraspCandidates(
             grasps,
             np.eye(4),
             self._gripper,
@@ -161,7 +161,7 @@ class TrueScene:
             fallback_width_m=planner.fallback_width_m,
             chunk=len(grasps),
         )
-        ranking = AbilityRanking(self.kinematics, self._checker, candidates, planner)
+        ranking = ReachabilityRanker(self.kinematics, self._checker, candidates, planner)
         rejected: Counter[str] = Counter()
         found, ranks, eases, n_clear = [], [], [], 0
         for rank in range(len(candidates)):
@@ -191,7 +191,7 @@ class TrueScene:
         """Return the whole motion of `option`.
 
         Raises:
-            Refused: it cannot be gone after all.
+            CandidateRejected: it cannot be gone after all.
         """
         way, motion = self._motions.first_motion([option.way])
         return GraspPlan(

@@ -20,7 +20,7 @@ from sim_twin.benchmark.episodes.trial import Mode, Outcome, Robot
 from sim_twin.benchmark.oracle.candidates import SweepConfig
 from sim_twin.benchmark.oracle.options import EXACT_PLANNER, Options, TrueScene
 from z1_runtime.geometry.kinematics import Kinematics
-from z1_runtime.planning.pick_motion import Refused
+from z1_runtime.planning.pick_motion import CandidateRejected
 from z1_runtime.planning.planner_config import PlannerConfig
 from z1_runtime.types import GraspPlan
 
@@ -113,7 +113,7 @@ class _Hunt:
                 continue
             try:
                 plan = self._truth.plan(choice)
-            except Refused as refusal:
+            except CandidateRejected as refusal:
                 self._refused[refusal.reason] += 1
                 options.fail(choice)
                 continue

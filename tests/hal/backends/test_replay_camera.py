@@ -14,15 +14,15 @@ from hal.base.errors import CameraError, HalTimeoutError
 
 
 def test_frames_survive_the_file(tmp_path: Path) -> None:
-    frames = [replace(f, truth_mask=f.depth_m < 0.4) for f in make_demo_frames()]
+    frames = [replace(f, ground_truth_mask=f.depth_m < 0.4) for f in make_demo_frames()]
     save_frames(tmp_path / "run.npz", frames)
     loaded = load_frames(tmp_path / "run.npz")
     assert len(loaded) == len(frames)
     for before, after in zip(frames, loaded, strict=True):
         assert (before.colour == after.colour).all()
         assert (before.depth_m == after.depth_m).all()
-        assert after.truth_mask is not None
-        assert (before.truth_mask == after.truth_mask).all()
+        assert after.ground_truth_mask is not None
+        assert (before.ground_truth_mask == after.ground_truth_mask).all()
         assert (before.intrinsics, before.stamp_s, before.sequence) == (
             after.intrinsics,
             after.stamp_s,

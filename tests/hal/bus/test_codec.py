@@ -52,7 +52,7 @@ STATUS = ServoStatus(
 SAMPLES = [
     INTRINSICS,
     RgbdFrame(**IMAGES),
-    RgbdFrame(**IMAGES, truth_mask=RNG.uniform(size=(4, 6)) > 0.5),
+    RgbdFrame(**IMAGES, ground_truth_mask=RNG.uniform(size=(4, 6)) > 0.5),
     ArmState(stamp_s=1.5, q=RNG.normal(size=7), dq=RNG.normal(size=7), tau=RNG.normal(size=7), faults=("hot", "ü")),
     ArmSetpoint(q=RNG.normal(size=7), dq=RNG.normal(size=7)),
     TrajectoryChunk(

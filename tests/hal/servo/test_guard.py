@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from hal.base import z1
 from hal.base.errors import CommandRejectedError
 from hal.base.messages import ServoMode, TrajectoryChunk
-from hal.base.z1_shape import HAND_POINTS
+from hal.base.z1_shape import GRIPPER_POINTS
 from hal.servo.guard import Guard, Workspace
 from hal.servo.guard_kernels import segment_distance
 from tests.support.servo_bench import START, Bench, move, setpoint
@@ -44,7 +44,7 @@ def test_its_kinematics_are_the_urdfs(shares: list[float]) -> None:
     space = Guard(Workspace(lower_m=(0.0, -9.0, -9.0), upper_m=(9.0, 9.0, 9.0)))
     q[6] = 0.0
     T = pivot(q)
-    corners = HAND_POINTS @ T[:3, :3].T + T[:3, 3]
+    corners = GRIPPER_POINTS @ T[:3, :3].T + T[:3, 3]
     expected = corners[:, 0].min()
     assert float(space.margins(q[None]).box_m[0]) <= expected + 1e-9
 

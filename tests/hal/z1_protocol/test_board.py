@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hal.z1_protocol import board
-from hal.z1_protocol.records import JointCommands, JointStates, WireError
+from hal.z1_protocol.records import JointCommands, JointStates, ProtocolError
 
 
 def joints(n: int, value: float) -> np.ndarray:
@@ -75,19 +75,19 @@ def test_the_self_check_is_the_golden_bytes_both_ways() -> None:
     "data", [b"", b"\x20", b"\x20\x08", b"\x20\x08" + bytes(9), b"\x21\x07" + bytes(7), b"\x20\x00"]
 )
 def test_what_is_no_self_check_is_refused(data: bytes) -> None:
-    with pytest.raises(WireError, match="self-check"):
+    with pytest.raises(ProtocolError, match="self-check"):
         board.decode_self_check(data)
 
 
 @pytest.mark.parametrize("size", [0, 1, 119, 121, 139, 141, 147, 154, 1500])
 def test_a_command_of_a_wrong_size_is_refused(size: int) -> None:
-    with pytest.raises(WireError, match=f"{size} bytes"):
+    with pytest.raises(ProtocolError, match=f"{size} bytes"):
         board.decode_command(bytes(size))
 
 
 @pytest.mark.parametrize("size", [0, 1, 95, 111, 131, 140, 153, 155, 208, 1500])
 def test_a_state_of_a_wrong_size_is_refused(size: int) -> None:
-    with pytest.raises(WireError, match=f"{size} bytes"):
+    with pytest.raises(ProtocolError, match=f"{size} bytes"):
         board.decode_state(bytes(size))
 
 
@@ -95,11 +95,11 @@ def test_values_that_are_not_finite_are_refused() -> None:
     nan = bytes.fromhex("0000c07f")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        with pytest.raises(WireError, match="tau of joint1 is nan"):
+        with pytest.raises(ProtocolError, match="tau of joint1 is nan"):
             board.decode_command(nan + board.encode_command(commands(7))[4:])
-        with pytest.raises(WireError, match="tau of joint1 is nan"):
+        with pytest.raises(ProtocolError, match="tau of joint1 is nan"):
             board.decode_state(nan + board.encode_state(states(7))[4:])
-    with pytest.raises(WireError, match="q of joint1 is inf"):
+    with pytest.raises(ProtocolError, match="q of joint1 is inf"):
         board.encode_command(JointCommands(q=joints(7, np.inf)))
 
 
@@ -115,7 +115,7 @@ def test_random_datagrams_are_decoded_or_refused_and_nothing_else() -> None:
                 try:
                     read(data)
                     outcomes["read"] += 1
-                except WireError:
+                except ProtocolError:
                     outcomes["refused"] += 1
     assert sum(outcomes.values()) == 30_000
     assert min(outcomes.values()) > 0

@@ -10,7 +10,7 @@ import pytest
 
 from hal.z1_protocol import controller, records
 from hal.z1_protocol.controller import Command, CommandBuffer, ControllerState, TrajectoryCommand
-from hal.z1_protocol.records import JointCommands, JointStates, WireError
+from hal.z1_protocol.records import JointCommands, JointStates, ProtocolError
 from hal.z1_protocol.states import Fsm
 
 # head FE FF, state 2 (JOINTCTRL), track 1, then joint1: tau 1.0, dq 0.5, q -2.0, kp 20.0, kd 2000.0
@@ -124,25 +124,25 @@ def test_a_label_lies_where_the_controller_looks_for_it() -> None:
 
 @pytest.mark.parametrize("label", ["", "01234567890", "grün", "two words", "a\nb"])
 def test_a_label_that_cannot_be_sent_is_refused(label: str) -> None:
-    with pytest.raises(WireError, match="label"):
+    with pytest.raises(ProtocolError, match="label"):
         controller.encode_command(Fsm.TOSTATE, label)
 
 
 @pytest.mark.parametrize("body", [bytes(140), b"\xff" * 140, b" forward".ljust(140, b"\0")])
 def test_a_label_that_is_none_is_refused(body: bytes) -> None:
-    with pytest.raises(WireError, match="label"):
+    with pytest.raises(ProtocolError, match="label"):
         Command(state=Fsm.TOSTATE, track=False, body=body).label()
 
 
 @pytest.mark.parametrize("size", [0, 1, 6, 146, 148, 208, 1500, 65_000])
 def test_a_command_that_is_cut_or_too_long_is_refused(size: int) -> None:
-    with pytest.raises(WireError, match=f"{size} bytes; allowed are 147"):
+    with pytest.raises(ProtocolError, match=f"{size} bytes; allowed are 147"):
         controller.decode_command((GOLDEN_COMMAND * 500)[:size])
 
 
 @pytest.mark.parametrize("size", [0, 1, 5, 147, 207, 209, 65_000])
 def test_a_state_that_is_cut_or_too_long_is_refused(size: int) -> None:
-    with pytest.raises(WireError, match=f"{size} bytes; allowed are 208"):
+    with pytest.raises(ProtocolError, match=f"{size} bytes; allowed are 208"):
         controller.decode_state((GOLDEN_STATE * 400)[:size])
 
 
@@ -156,7 +156,7 @@ def test_a_state_that_is_cut_or_too_long_is_refused(size: int) -> None:
     ],
 )
 def test_a_command_with_a_corrupt_head_is_refused(at: int, value: bytes, text: str) -> None:
-    with pytest.raises(WireError, match=text):
+    with pytest.raises(ProtocolError, match=text):
         controller.decode_command(patched(GOLDEN_COMMAND, at, value))
 
 
@@ -175,7 +175,7 @@ def test_a_command_with_a_corrupt_head_is_refused(at: int, value: bytes, text: s
     ],
 )
 def test_a_state_with_an_impossible_field_is_refused(at: int, value: bytes, text: str) -> None:
-    with warnings.catch_warnings(), pytest.raises(WireError, match=text):
+    with warnings.catch_warnings(), pytest.raises(ProtocolError, match=text):
         warnings.simplefilter("error")
         controller.decode_state(patched(GOLDEN_STATE, at, value))
 
@@ -184,25 +184,25 @@ def test_a_command_whose_body_is_not_finite_is_refused_when_it_is_read() -> None
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         for value in (struct.pack("<f", np.nan), bytes.fromhex("0100807f"), struct.pack("<f", -np.inf)):
-            with pytest.raises(WireError, match="q of joint1"):
+            with pytest.raises(ProtocolError, match="q of joint1"):
                 controller.decode_command(patched(GOLDEN_COMMAND, 15, value)).joints()
-        with pytest.raises(WireError, match="not finite"):
+        with pytest.raises(ProtocolError, match="not finite"):
             controller.decode_command(patched(GOLDEN_COMMAND, 11, struct.pack("<d", np.nan))).trajectory()
 
 
 def test_what_is_not_finite_is_never_sent() -> None:
-    with pytest.raises(WireError, match="tau of joint1 is inf"):
+    with pytest.raises(ProtocolError, match="tau of joint1 is inf"):
         controller.encode_command(Fsm.LOWCMD, JointCommands(tau=one_joint(1e300)))
-    with pytest.raises(WireError, match="not finite"):
+    with pytest.raises(ProtocolError, match="not finite"):
         controller.encode_command(Fsm.MOVEJ, TrajectoryCommand(max_speed=np.nan))
-    with pytest.raises(WireError, match="q of joint1 is nan"):
+    with pytest.raises(ProtocolError, match="q of joint1 is nan"):
         controller.encode_state(
             ControllerState(state=Fsm.PASSIVE, joints=JointStates(q=one_joint(np.nan)), pose=np.zeros(6))
         )
 
 
 def test_what_does_not_fit_is_never_sent() -> None:
-    with pytest.raises(WireError, match="160 bytes"):
+    with pytest.raises(ProtocolError, match="160 bytes"):
         controller.encode_command(Fsm.LOWCMD, JointCommands(**{n: np.zeros(8) for n in ("q", "dq", "tau", "kp", "kd")}))
 
 
@@ -221,7 +221,7 @@ def test_random_datagrams_are_decoded_or_refused_and_nothing_else() -> None:
                 try:
                     read(bytes(data))
                     outcomes["read"] += 1
-                except WireError:
+                except ProtocolError:
                     outcomes["refused"] += 1
     assert sum(outcomes.values()) == 100_000
     assert min(outcomes.values()) > 10_000
@@ -232,5 +232,5 @@ def read_command(data: bytes) -> None:
     for read in (command.joints, command.trajectory, command.label):
         try:
             read()
-        except WireError:
+        except ProtocolError:
             continue

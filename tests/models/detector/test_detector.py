@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from models.detector import modules, runtimes
-from models.detector.detector import YoloConfig, YoloDetector, best_of, labels_for
+from models.detector.detector import YoloConfig, YoloModel, best_of, labels_for
 from models.detector.image import Letterbox
 from models.detector.runtimes import RUNTIMES, installed_runtimes, open_network
 from models.detector.weights import CLASSES, save_detector
@@ -88,7 +88,7 @@ def iou(a, b):
 def test_boxes_and_masks_are_those_of_ultralytics(ours, checkpoint, shape):
     image = picture(*shape)
     options = {"min_confidence": 0.4, "max_iou": 0.6, "max_detections": 100, "mirrored": False}
-    detector = YoloDetector(YoloConfig(weights=ours, runtime="onnxruntime", **options))
+    detector = YoloModel(YoloConfig(weights=ours, runtime="onnxruntime", **options))
     found = detector.detect(image)
     labels, confidences, boxes, masks = predict(checkpoint, image, SIZE, conf=0.4, iou=0.6, max_det=100)
     assert len(found) > 10
@@ -110,7 +110,7 @@ def test_every_class_of_a_box_counts_as_in_ultralytics_validator(ours):
     least = float(np.quantile(rows[4:7].min(axis=0), 0.5))
     (wanted,) = non_max_suppression(torch.from_numpy(rows[None]), least, 0.7, multi_label=True, max_det=300, nc=3)
     options = {"min_confidence": least, "max_iou": 0.7, "max_detections": 300, "mirrored": False, "every_class": True}
-    found = YoloDetector(YoloConfig(weights=ours, runtime="onnxruntime", **options)).detect(image)
+    found = YoloModel(YoloConfig(weights=ours, runtime="onnxruntime", **options)).detect(image)
     names = [network.names[int(number)] for number in wanted[:, 5]]
     boxes = wanted[:, :4].numpy().clip(0, [SIZE[1], SIZE[0]] * 2)
     matched(found, names, wanted[:, 4].numpy(), boxes)
@@ -123,7 +123,7 @@ def test_a_network_without_masks_gives_boxes_alone(tmp_path):
     save_checkpoint(path, detecting(), ("bottle", "cup", "dog"), "detect")
     image = picture(480, 640)
     config = YoloConfig(weights=path, runtime="onnxruntime", max_iou=0.7, max_detections=100, mirrored=False)
-    found = YoloDetector(config).detect(image)
+    found = YoloModel(config).detect(image)
     labels, confidences, boxes, masks = predict(path, image, (480, 640), conf=0.5, iou=0.7, max_det=100)
     assert masks is None
     assert len(found) > 5
@@ -136,7 +136,7 @@ def test_what_is_seen_in_the_mirror_is_the_mirror_image_of_what_is_seen(ours):
     image = picture(*SIZE)
     misses = {}
     for mirrored in (True, False):
-        detector = YoloDetector(YoloConfig(weights=ours, runtime="onnxruntime", mirrored=mirrored, max_detections=100))
+        detector = YoloModel(YoloConfig(weights=ours, runtime="onnxruntime", mirrored=mirrored, max_detections=100))
         seen, in_mirror = detector.detect(image), detector.detect(np.ascontiguousarray(image[:, ::-1]))
         assert len(seen) > 5
         misses[mirrored] = sum(not any(mirror_images(a, b) for b in in_mirror) for a in seen)
@@ -152,7 +152,7 @@ def mirror_images(a, b):
 def test_a_network_with_other_anchors_looks_once(ours, monkeypatch):
     monkeypatch.setattr("models.detector.detector.n_anchors", lambda _: -1)
     other, once = (
-        YoloDetector(YoloConfig(weights=ours, runtime="onnxruntime", mirrored=mirrored)) for mirrored in (True, False)
+        YoloModel(YoloConfig(weights=ours, runtime="onnxruntime", mirrored=mirrored)) for mirrored in (True, False)
     )
     boxes = [[d.box_px for d in detector.detect(picture(*SIZE))] for detector in (other, once)]
     assert boxes[0] == boxes[1]
@@ -176,7 +176,7 @@ def test_every_runtime_sees_the_same(ours, network, runtime):
 
 @pytest.mark.parametrize("runtime", RUNTIMES)
 def test_detection_repeats_bit_by_bit(ours, runtime):
-    detector = YoloDetector(YoloConfig(weights=ours, runtime=runtime))
+    detector = YoloModel(YoloConfig(weights=ours, runtime=runtime))
     first, second = (detector.detect(picture(*SIZE)) for _ in range(2))
     assert len(first) > 3
     for a, b in zip(first, second, strict=True):
@@ -186,7 +186,7 @@ def test_detection_repeats_bit_by_bit(ours, runtime):
 
 def test_torch_keeps_the_number_of_threads_that_others_chose(ours):
     torch.set_num_threads(2)
-    YoloDetector(YoloConfig(weights=ours, runtime="torch")).detect(picture(*SIZE))
+    YoloModel(YoloConfig(weights=ours, runtime="torch")).detect(picture(*SIZE))
     chosen = torch.get_num_threads()
     torch.set_num_threads(1)
     assert chosen == 2
@@ -194,12 +194,12 @@ def test_torch_keeps_the_number_of_threads_that_others_chose(ours):
 
 def test_the_first_runtime_that_is_installed_is_taken(ours, monkeypatch):
     assert installed_runtimes(ours) == RUNTIMES  # the tests' environment has them all
-    assert YoloDetector(YoloConfig(weights=ours)).runtime == "openvino"
+    assert YoloModel(YoloConfig(weights=ours)).runtime == "openvino"
     gone = {"openvino"}
     monkeypatch.setattr(runtimes, "find_spec", lambda name: None if name in gone else object())
-    assert YoloDetector(YoloConfig(weights=ours)).runtime == "onnxruntime"
+    assert YoloModel(YoloConfig(weights=ours)).runtime == "onnxruntime"
     gone.add("onnx")  # without which ours cannot be exported
-    assert YoloDetector(YoloConfig(weights=ours)).runtime == "torch"
+    assert YoloModel(YoloConfig(weights=ours)).runtime == "torch"
     with pytest.raises(ValueError, match=r"cannot be run by openvino; installed and able: torch.*fast-detector"):
         open_network(ours, "openvino")
     gone.add("ultralytics")
@@ -208,7 +208,7 @@ def test_the_first_runtime_that_is_installed_is_taken(ours, monkeypatch):
 
 
 def test_what_is_confident_comes_first_and_the_rest_is_cut(ours):
-    detector = YoloDetector(YoloConfig(weights=ours, max_detections=5))
+    detector = YoloModel(YoloConfig(weights=ours, max_detections=5))
     found = detector.detect(picture(*SIZE), min_confidence=0.1)
     assert len(found) == 5
     confidences = [d.confidence for d in found]
@@ -267,7 +267,7 @@ def test_an_openvino_folder_of_a_user_is_read(ours, tmp_path):
     openvino.save_model(openvino.Core().read_model(modules.exported(ours)), folder / "mine.xml")
     (folder / "metadata.yaml").write_text("task: segment\nnames:\n  0: bottle\n  1: cylinder\n  2: box\n")
     assert installed_runtimes(folder / "mine.xml") == ("openvino",)
-    detectors = [YoloDetector(YoloConfig(weights=path)) for path in (folder, folder / "mine.xml", ours)]
+    detectors = [YoloModel(YoloConfig(weights=path)) for path in (folder, folder / "mine.xml", ours)]
     assert {detector.classes for detector in detectors} == {CLASSES}
     found = [detector.detect(picture(*SIZE)) for detector in detectors]
     assert len(found[0]) == len(found[1]) > 3
@@ -281,8 +281,8 @@ def test_what_ultralytics_exports_is_read(checkpoint, tmp_path):
     copy.write_bytes(checkpoint.read_bytes())
     exported = YOLO(copy).export(format="onnx", imgsz=list(SIZE), dynamic=True, simplify=False, opset=17, verbose=False)
     image = picture(480, 640)
-    theirs = YoloDetector(YoloConfig(weights=tmp_path / exported, runtime="onnxruntime")).detect(image)
-    ours = YoloDetector(YoloConfig(weights=copy, runtime="onnxruntime")).detect(image)
+    theirs = YoloModel(YoloConfig(weights=tmp_path / exported, runtime="onnxruntime")).detect(image)
+    ours = YoloModel(YoloConfig(weights=copy, runtime="onnxruntime")).detect(image)
     assert len(theirs) > 3
     assert [(d.label, d.box_px) for d in theirs] == [(d.label, d.box_px) for d in ours]
 
@@ -385,7 +385,7 @@ def test_a_graph_of_another_kind_is_refused(tmp_path, runtime, graph, said):
 @pytest.mark.parametrize("runtime", ["openvino", "onnxruntime"])
 def test_an_image_without_anything_in_it_gives_nothing(tmp_path, runtime):
     save_graph(tmp_path / "blind.onnx", 6)
-    detector = YoloDetector(YoloConfig(weights=tmp_path / "blind.onnx", runtime=runtime))
+    detector = YoloModel(YoloConfig(weights=tmp_path / "blind.onnx", runtime=runtime))
     assert detector.detect(np.zeros((48, 64, 3), np.uint8)) == []
 
 
@@ -399,7 +399,7 @@ def test_an_unknown_runtime_is_refused_with_the_known_ones(ours):
 )
 def test_an_image_of_another_kind_is_refused(ours, image):
     with pytest.raises(ValueError, match=r"takes \(H, W, 3\) uint8 RGB"):
-        YoloDetector(YoloConfig(weights=ours)).detect(image)
+        YoloModel(YoloConfig(weights=ours)).detect(image)
 
 
 @pytest.mark.parametrize("wrong", [{"min_confidence": 1.0}, {"max_iou": 0.0}, {"max_detections": 0}])

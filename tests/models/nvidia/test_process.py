@@ -13,7 +13,7 @@ import pytest
 
 from models.nvidia.errors import GeneratorError
 from models.nvidia.process import WORKER, ProcessGenerator
-from models.nvidia.wire import WireError, read_message, write_message
+from models.nvidia.wire import PipeError, read_message, write_message
 
 PYTHON = Path(sys.executable)
 CLOUD = np.random.default_rng(0).uniform([-0.03, -0.05, 0.38], [0.03, 0.05, 0.42], (200, 3))
@@ -162,11 +162,11 @@ def test_messages_that_are_cut_too_long_or_no_arrays_are_refused():
     assert message is not None and message["a"].tolist() == [0, 1, 2] and str(message["b"]) == "words"
     assert read_message(io.BytesIO(b"")) is None
     for cut in (data[:5], data[:-1]):
-        with pytest.raises(WireError, match="ended within"):
+        with pytest.raises(PipeError, match="ended within"):
             read_message(io.BytesIO(cut))
-    with pytest.raises(WireError, match="announced"):
+    with pytest.raises(PipeError, match="announced"):
         read_message(io.BytesIO(b"\xff" * 20))
-    with pytest.raises(WireError, match="no plain arrays"):
+    with pytest.raises(PipeError, match="no plain arrays"):
         read_message(io.BytesIO(data[:8] + b"x" * (len(data) - 8)))
     with pytest.raises(ValueError, match=r"[Oo]bject arrays"):
         write_message(io.BytesIO(), {"a": np.array([{}], dtype=object)})

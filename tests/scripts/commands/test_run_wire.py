@@ -18,7 +18,7 @@ from hal.z1_protocol.states import Fsm
 from scripts.commands.run_demo import LIFTED_M
 from scripts.commands.run_demo import Config as DemoConfig
 from scripts.commands.run_wire import Config, make_scene, start_pose
-from scripts.support.rig_option import RigWord
+from scripts.support.rig_option import RigOption
 from sim_twin.drop_in.process import make_twin
 from sim_twin.drop_in.rig import free_ports
 
@@ -110,4 +110,4 @@ def test_the_demo_lifts_the_bottle_through_both_real_drivers(tmp_path: Path) -> 
 
 def test_a_demo_through_the_wire_cannot_be_in_lockstep() -> None:
     with pytest.raises(ValueError, match="leave out --wire-sim"):
-        DemoConfig(rig=RigWord(wire_sim=True), lockstep=True)
+        DemoConfig(rig=RigOption(wire_sim=True), lockstep=True)

@@ -15,7 +15,7 @@ from hal.bus.client import RemoteArm, RemoteCamera
 from hal.bus.session import BusConfig
 from hal.rig import RIGS
 from scripts.commands import run_demo, run_hal
-from scripts.support.rig_option import RigWord
+from scripts.support.rig_option import RigOption
 from sim_twin.drop_in.rig import free_ports
 
 
@@ -43,8 +43,8 @@ def test_two_words_are_one_too_many(capsys: pytest.CaptureFixture[str]) -> None:
     assert "not allowed together" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("word", [RigWord(real=True), RigWord(mock=True)])
-def test_a_demo_of_other_hardware_than_the_twin_is_refused_with_the_way_to_it(word: RigWord) -> None:
+@pytest.mark.parametrize("word", [RigOption(real=True), RigOption(mock=True)])
+def test_a_demo_of_other_hardware_than_the_twin_is_refused_with_the_way_to_it(word: RigOption) -> None:
     with pytest.raises(ValueError, match=f"./z1 hal --hal {word.name}, and beside it ./z1 run"):
         run_demo.Config(rig=word)
 

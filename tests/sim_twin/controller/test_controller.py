@@ -19,7 +19,7 @@ from hal.z1_protocol.controller import (
     decode_command,
     encode_command,
 )
-from hal.z1_protocol.records import JointCommands, JointStates, WireError
+from hal.z1_protocol.records import JointCommands, JointStates, ProtocolError
 from hal.z1_protocol.states import MOVES, Fsm, granted
 from sim_twin.controller.controlled_world import ControlledWorld
 from sim_twin.controller.controller import LABEL_SPEED, Controller
@@ -362,11 +362,11 @@ def test_out_of_lowcmd_the_arm_is_held_where_it_is(arm: IdealArm) -> None:
 def test_a_body_that_is_not_finite_changes_nothing(arm: IdealArm) -> None:
     broken = bytearray(encode_command(Fsm.LOWCMD))
     broken[7:11] = np.float32(np.nan).tobytes()
-    with pytest.raises(WireError, match="must be finite"):
+    with pytest.raises(ProtocolError, match="must be finite"):
         arm.controller.obey(decode_command(bytes(broken)))
     assert arm.controller.fsm is Fsm.PASSIVE
     arm.ask(Fsm.JOINTCTRL)
-    with pytest.raises(WireError, match="a label is"):
+    with pytest.raises(ProtocolError, match="a label is"):
         arm.controller.obey(decode_command(encode_command(Fsm.TOSTATE)))
     assert arm.controller.fsm is Fsm.JOINTCTRL
 

@@ -17,7 +17,7 @@ from sim_twin.detection_data.scenes import (
     LEAST_MARK_SHARE,
     LEAST_PIXELS,
     LEAST_SHARE,
-    Look,
+    Appearance,
     SceneMix,
     draw_scenario,
     draw_scene,
@@ -96,8 +96,8 @@ def test_a_scenario_has_the_mask_that_the_twin_has(stage: Stage, name: str) -> N
 
 
 @needs_egl
-@pytest.mark.parametrize("look", get_args(Look))
-def test_an_object_has_its_own_colours_unless_any_will_do(stage: Stage, look: Look) -> None:
+@pytest.mark.parametrize("look", get_args(Appearance))
+def test_an_object_has_its_own_colours_unless_any_will_do(stage: Stage, look: Appearance) -> None:
     actor, pose = stage.named("cylinder")[0], SceneConfig(object="cylinder").T_base_object()
     own = [part.rgba for part, _ in actor.prop.parts]
     alike = []

@@ -17,7 +17,7 @@ from hal.backends.d405.session import D405CameraConfig
 from hal.backends.z1.config import Z1Mode
 from hal.base import z1
 from hal.base.clock import WallClock
-from hal.base.d405 import Look
+from hal.base.d405 import CaptureRequest
 from hal.base.errors import HalError, LeaseError
 from hal.base.messages import ArmSetpoint
 from hal.rig import RIGS
@@ -28,7 +28,7 @@ from sim_twin.drop_in.process import WireProcess
 from sim_twin.drop_in.realsense_source import TwinSource
 from sim_twin.drop_in.rig import WiredArm, WiredCamera, free_ports
 from sim_twin.drop_in.shared_memory import SharedWorld, make_memory
-from sim_twin.ground_truth import read_truth
+from sim_twin.ground_truth import read_ground_truth
 from sim_twin.model.scene import SceneConfig
 from sim_twin.model.world import World
 
@@ -107,7 +107,7 @@ def test_the_real_driver_reads_the_twins_faults(twin: WireProcess) -> None:
 
 
 def test_the_truth_is_told_from_here(twin: WireProcess) -> None:
-    truth = read_truth(twin)
+    truth = read_ground_truth(twin)
     assert truth.object == "bottle"
     assert truth.lifted_m == pytest.approx(0.0, abs=1e-3)
     assert truth.T_base_object[0, 3] == pytest.approx(0.48, abs=0.01)
@@ -141,7 +141,7 @@ def test_pictures_cross_as_they_were_drawn() -> None:
     SharedWorld(memory).publish(*world.poses())
     os.write(model, pickle.dumps(world.model))
     standing = cast(WireProcess, SimpleNamespace(config=world.config, memory=memory, model_file=model))
-    look = Look(number=7, width=424, height=240, depth=True, colour=True, left=True, right=True)
+    look = CaptureRequest(number=7, width=424, height=240, depth=True, colour=True, left=True, right=True)
     remote = RemoteSource(standing)
     there = remote.expose(look)
     with TwinSource(world, WallClock()) as source:
@@ -149,7 +149,7 @@ def test_pictures_cross_as_they_were_drawn() -> None:
     for name in ("depth", "colour", "left", "right"):
         np.testing.assert_array_equal(getattr(there, name), getattr(here, name))
     assert there.number == 7
-    only = remote.expose(Look(number=8, width=640, height=480, depth=True))
+    only = remote.expose(CaptureRequest(number=8, width=640, height=480, depth=True))
     assert only.depth is not None
     assert only.depth.shape == (480, 640)
     assert only.colour is None

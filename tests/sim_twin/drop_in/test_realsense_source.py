@@ -12,7 +12,7 @@ import pytest
 from hal.backends.d405.camera import D405Camera
 from hal.backends.d405.session import D405CameraConfig
 from hal.base.clock import WallClock
-from hal.base.d405 import BASELINE_M, DEPTH_UNIT_M, MIN_Z_M, Exposure, Look
+from hal.base.d405 import BASELINE_M, DEPTH_UNIT_M, MIN_Z_M, CaptureRequest, Exposure
 from hal.base.messages import Intrinsics
 from sim_twin.camera.render import make_renderer
 from sim_twin.camera.wrist_view import View
@@ -42,7 +42,7 @@ def source(world: World) -> Iterator[TwinSource]:
 def expose(
     source: TwinSource, width: int = 640, height: int = 480, number: int = 1, **wanted: bool | float
 ) -> Exposure:
-    return source.expose(Look(number=number, width=width, height=height, **wanted))  # type: ignore[arg-type]
+    return source.expose(CaptureRequest(number=number, width=width, height=height, **wanted))  # type: ignore[arg-type]
 
 
 def exact(world: World, pinhole: Intrinsics) -> View:

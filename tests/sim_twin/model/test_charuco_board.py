@@ -11,7 +11,7 @@ from hal.base import z1
 from sim_twin.backends import make_rig
 from sim_twin.camera import d405
 from sim_twin.camera.render import make_renderer
-from sim_twin.ground_truth import read_truth
+from sim_twin.ground_truth import read_ground_truth
 from sim_twin.model.charuco_board import THICKNESS_M, BoardSpec
 from sim_twin.model.scene import SceneConfig, build_model
 from sim_twin.model.world import World
@@ -76,9 +76,9 @@ def test_the_pose_is_right_handed_and_its_origin_the_corner_of_the_print():
 def test_the_board_can_be_touched_and_the_object_stands_out_of_reach(world: World):
     assert world.model.geom("board_plate").contype != 0
     assert np.linalg.norm(world.T_base_object()[:2, 3]) > 1.0  # the arm ends at 0.74 m
-    truth = read_truth(world)
+    truth = read_ground_truth(world)
     assert truth.T_base_board is not None and np.array_equal(truth.T_base_board, SPEC.T_base_board())
-    assert read_truth(World(SceneConfig())).T_base_board is None
+    assert read_ground_truth(World(SceneConfig())).T_base_board is None
 
 
 def test_a_mount_off_its_drawing_is_off_by_what_was_asked_and_has_a_serial_of_its_own():

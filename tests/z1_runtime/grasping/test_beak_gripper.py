@@ -14,7 +14,7 @@ from z1_runtime.geometry.gripper_geometry import (
     MOVER_FACE,
     STATOR_FACE,
     BeakConfig,
-    mover_pose,
+    moving_jaw_pose,
 )
 from z1_runtime.grasping.beak_gripper import BeakGripper, WidthError
 
@@ -41,7 +41,7 @@ def mover() -> np.ndarray:
 def lateral_gaps(T_base_pivot: np.ndarray, jaw: float, stator: np.ndarray, mover: np.ndarray, r: float) -> list[float]:
     """Return each jaw's distance from a disc-shaped pillar of radius `r` along grasp x at the grasp frame's origin."""
     gaps = []
-    for T, points in ((T_base_pivot, stator), (T_base_pivot @ mover_pose(jaw), mover)):
+    for T, points in ((T_base_pivot, stator), (T_base_pivot @ moving_jaw_pose(jaw), mover)):
         in_grasp = points @ T[:3, :3].T + T[:3, 3]
         gaps.append(float(np.hypot(in_grasp[:, 1], in_grasp[:, 2]).min() - r))
     return gaps

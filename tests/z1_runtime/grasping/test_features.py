@@ -19,12 +19,12 @@ from tests.support.tabletop_scenes import (
     make_observation,
 )
 from z1_runtime.config import RuntimeConfig
-from z1_runtime.factory import make_decider
+from z1_runtime.factory import make_grasp_selector
 from z1_runtime.geometry.kinematics import Kinematics
 from z1_runtime.grasping.features import FEATURES
 from z1_runtime.grasping.ranking import Ranking, Scoring, ScoringError, ScoringHead, save_scoring
 from z1_runtime.planning.planner import GraspPlanner
-from z1_runtime.tasks.grasp_selection import Decider, draw_can
+from z1_runtime.tasks.grasp_selection import GraspSelector, draw_can
 from z1_runtime.types import Observation
 
 AT = (0.46, 0.08)
@@ -89,8 +89,8 @@ def test_what_is_below_a_threshold_comes_last_but_is_not_lost(planner, observati
 
 
 def test_a_decider_reads_the_file_that_its_configuration_names(tmp_path):
-    def decider(config: RuntimeConfig) -> Decider:
-        return make_decider(replace(config, n_candidates=200))
+    def decider(config: RuntimeConfig) -> GraspSelector:
+        return make_grasp_selector(replace(config, n_candidates=200))
 
     q = np.append(z1.Q_HOME, -1.0)
     plain = decider(RuntimeConfig(detector="tabletop"))

@@ -9,7 +9,7 @@ from tests.support.tabletop_scenes import camera_pose, frontal, in_camera, make_
 from z1_runtime.collision.scene_collision import CollisionChecker
 from z1_runtime.geometry.kinematics import Kinematics
 from z1_runtime.grasping.beak_gripper import BeakGripper
-from z1_runtime.grasping.grasp_candidates import Candidates
+from z1_runtime.grasping.grasp_candidates import GraspCandidates
 
 ASKED_M, SLANT, RADIUS_M, HEIGHT_M = 0.50, 0.2, 0.02, 0.1
 
@@ -30,7 +30,7 @@ def test_the_middle_is_measured_where_the_object_is_held(front_m):
     checker = CollisionChecker(kinematics, observation, None)
     asked = frontal(ASKED_M, 0.0, HEIGHT_M, 0.0, yaw_rad=0.0)
     grasps = in_camera(T_base_camera, [asked], 2.0 * RADIUS_M)
-    candidates = Candidates(grasps, T_base_camera, gripper, checker, fallback_width_m=0.06)
+    candidates = GraspCandidates(grasps, T_base_camera, gripper, checker, fallback_width_m=0.06)
     (T,) = candidates._measure(slice(0, 1))
     setback = gripper.fit_batch(T[None], candidates.widths_m, candidates._fronts_m).setback_m[0]
     assert (setback > 0.010) == (front_m == 0.050)

@@ -19,7 +19,7 @@ from tests.support.tabletop_scene import (
     truth,
 )
 from z1_runtime.perception import detectors
-from z1_runtime.perception.detectors import TabletopDetector, TruthDetector, make_detector, mask_box
+from z1_runtime.perception.detectors import GroundTruthDetector, TabletopDetector, make_detector, mask_box
 from z1_runtime.perception.point_cloud import PerceptionError
 from z1_runtime.perception.table_plane import NoTableError
 
@@ -135,25 +135,25 @@ def test_detection_repeats_bit_by_bit():
 
 def test_the_truth_detector_gives_the_truth():
     frame = noisy_frame([BOTTLE])
-    (found,) = TruthDetector().detect(frame, T_base_camera())
+    (found,) = GroundTruthDetector().detect(frame, T_base_camera())
     assert (found.mask == truth(frame)).all()
     assert found.confidence == 1.0
 
 
 def test_the_truth_detector_finds_nothing_when_the_object_is_out_of_view():
     frame = frame_of(d405(cast([])[0], 0), np.zeros((480, 640), bool))
-    assert TruthDetector().detect(frame, T_base_camera()) == []
+    assert GroundTruthDetector().detect(frame, T_base_camera()) == []
 
 
 def test_the_truth_detector_names_the_way_out_when_there_is_no_truth():
     frame = frame_of(d405(cast([])[0], 0))
     with pytest.raises(PerceptionError, match="only the twin's frames carry a truth mask; use --detector tabletop"):
-        TruthDetector().detect(frame, T_base_camera())
+        GroundTruthDetector().detect(frame, T_base_camera())
 
 
 def test_detectors_are_made_by_name():
     assert isinstance(make_detector("tabletop"), TabletopDetector)
-    assert isinstance(make_detector("truth"), TruthDetector)
+    assert isinstance(make_detector("truth"), GroundTruthDetector)
     with pytest.raises(ValueError, match="no detector 'yolo9000'; known: tabletop, truth, yolo"):
         make_detector("yolo9000")
 
@@ -175,7 +175,7 @@ class Eye:
 
 @pytest.fixture
 def yolo(monkeypatch):
-    monkeypatch.setattr(detectors, "ColourDetector", Eye)
+    monkeypatch.setattr(detectors, "YoloModel", Eye)
     return make_detector("yolo", YoloConfig(min_confidence=0.6))
 
 

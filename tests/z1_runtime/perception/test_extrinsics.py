@@ -13,7 +13,7 @@ from calibration.camera_model import CameraModel
 from calibration.results import MAX_UNCERTAINTY_MM, Calibration, save_result
 from hal.base import z1
 from hal.base.errors import ConfigError
-from z1_runtime.perception.extrinsics import find_mount, results_folder
+from z1_runtime.perception.extrinsics import find_extrinsics, results_folder
 
 CAMERA = CameraModel.pinhole(fx=390.0, fy=390.0, cx=320.0, cy=240.0, width=640, height=480)
 ERRORS = dict.fromkeys(("rms_mm", "rms_deg", "holdout_mm", "holdout_deg", "diversity"), 0.1)
@@ -47,7 +47,7 @@ def test_the_newest_of_this_camera_is_taken_and_told(tmp_path: Path):
     keep(tmp_path, "A", 0.001)
     newest = keep(tmp_path, "A", 0.002)
     keep(tmp_path, "B", 0.003)
-    mount = find_mount("A", folder=tmp_path)
+    mount = find_extrinsics("A", folder=tmp_path)
     assert shift_m(mount.T_flange_camera) == pytest.approx(0.002)
     assert str(newest) in mount.origin and "camera A" in mount.origin and "±0.10 mm" in mount.origin
 
@@ -57,28 +57,28 @@ def test_a_damaged_newest_result_gives_way_to_the_one_before(tmp_path: Path, cap
     newest = keep(tmp_path, "A", 0.002)
     newest.write_text(newest.read_text()[:100])
     with caplog.at_level(logging.WARNING):
-        assert shift_m(find_mount("A", folder=tmp_path).T_flange_camera) == pytest.approx(0.001)
+        assert shift_m(find_extrinsics("A", folder=tmp_path).T_flange_camera) == pytest.approx(0.001)
     assert newest.name in caplog.text
 
 
 def test_without_a_result_of_this_camera_the_drawing_is_taken_and_told(tmp_path: Path):
     keep(tmp_path, "B", 0.003)
     for serial, said in (("A", "camera A"), ("", "no serial number")):
-        mount = find_mount(serial, folder=tmp_path)
+        mount = find_extrinsics(serial, folder=tmp_path)
         assert np.array_equal(mount.T_flange_camera, z1.T_FLANGE_CAMERA)
         assert "drawing" in mount.origin and said in mount.origin and str(tmp_path) in mount.origin
-    assert "drawing" in find_mount("A", folder=tmp_path / "missing").origin
+    assert "drawing" in find_extrinsics("A", folder=tmp_path / "missing").origin
 
 
 def test_a_file_of_another_camera_is_refused_with_both_serials(tmp_path: Path):
     with pytest.raises(ConfigError, match=r"camera B.*is A"):
-        find_mount("A", keep(tmp_path, "B", 0.003), tmp_path)
+        find_extrinsics("A", keep(tmp_path, "B", 0.003), tmp_path)
 
 
 def test_a_file_is_taken_even_where_there_is_a_newer_one(tmp_path: Path):
     older = keep(tmp_path, "A", 0.001)
     keep(tmp_path, "A", 0.002)
-    assert shift_m(find_mount("A", older, tmp_path).T_flange_camera) == pytest.approx(0.001)
+    assert shift_m(find_extrinsics("A", older, tmp_path).T_flange_camera) == pytest.approx(0.001)
 
 
 def test_files_that_are_no_hand_eye_result_of_a_wrist_camera_are_refused(tmp_path: Path):
@@ -94,14 +94,14 @@ def test_files_that_are_no_hand_eye_result_of_a_wrist_camera_are_refused(tmp_pat
         (lens, "intrinsics"),
     ):
         with pytest.raises(ConfigError, match=said):
-            find_mount("A", file, tmp_path)
+            find_extrinsics("A", file, tmp_path)
 
 
 def test_an_uncertain_result_is_used_with_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture):
     with caplog.at_level(logging.WARNING):
-        find_mount("A", keep(tmp_path, "A", 0.001, uncertainty_mm=0.9 * MAX_UNCERTAINTY_MM), tmp_path)
+        find_extrinsics("A", keep(tmp_path, "A", 0.001, uncertainty_mm=0.9 * MAX_UNCERTAINTY_MM), tmp_path)
         assert not caplog.records
-        mount = find_mount("A", keep(tmp_path, "A", 0.002, uncertainty_mm=2.5 * MAX_UNCERTAINTY_MM), tmp_path)
+        mount = find_extrinsics("A", keep(tmp_path, "A", 0.002, uncertainty_mm=2.5 * MAX_UNCERTAINTY_MM), tmp_path)
     assert shift_m(mount.T_flange_camera) == pytest.approx(0.002)
     assert "uncertainty_mm" in caplog.text and "calibrate again" in caplog.text
 

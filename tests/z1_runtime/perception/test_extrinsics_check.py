@@ -13,11 +13,11 @@ from hal.base.transforms import inverse, transform_points
 from sim_twin.benchmark.episodes.trial import look
 from sim_twin.model.scene import SceneConfig
 from z1_runtime.config import RuntimeConfig
-from z1_runtime.factory import make_decider
-from z1_runtime.perception.extrinsics_check import MountSight
+from z1_runtime.factory import make_grasp_selector
+from z1_runtime.perception.extrinsics_check import ExtrinsicsCheck
 
 AHEAD = np.array([[0.0, 0.0, 0.4]])
-SIGHT = MountSight()
+SIGHT = ExtrinsicsCheck()
 
 
 def taken(scene: SceneConfig) -> tuple[RgbdFrame, float, np.ndarray]:
@@ -73,7 +73,7 @@ def test_a_card_before_the_jaws_is_not_taken_for_them(straight: tuple[RgbdFrame,
 def test_a_decider_sees_by_the_mount_that_the_jaws_show_and_says_so_once(caplog: pytest.LogCaptureFixture) -> None:
     scene = SceneConfig(object="bottle", mount_error_m=0.003, mount_error_deg=1.0, mount_seed=3)
     frame, jaw, T_true = taken(scene)
-    decider = make_decider(RuntimeConfig(detector="tabletop", generator="antipodal"))
+    decider = make_grasp_selector(RuntimeConfig(detector="tabletop", generator="antipodal"))
     q = np.append(z1.Q_HOME, jaw)
     with caplog.at_level("WARNING", "z1_runtime.tasks.grasp_selection"):
         seen = [decider.observe(frame, q) for _ in range(2)]
@@ -87,7 +87,7 @@ def test_a_decider_sees_by_the_mount_that_the_jaws_show_and_says_so_once(caplog:
 def test_it_can_be_switched_off() -> None:
     scene = SceneConfig(object="bottle", mount_error_m=0.003, mount_error_deg=1.0, mount_seed=1)
     frame, jaw, _ = taken(scene)
-    assert MountSight(enabled=False).correct(frame, jaw, z1.T_FLANGE_CAMERA) is None
+    assert ExtrinsicsCheck(enabled=False).correct(frame, jaw, z1.T_FLANGE_CAMERA) is None
 
 
 @pytest.mark.parametrize(
@@ -101,4 +101,4 @@ def test_it_can_be_switched_off() -> None:
 )
 def test_numbers_that_make_no_sense_are_refused(wrong: dict, said: str) -> None:
     with pytest.raises(ValueError, match=said):
-        MountSight(**wrong)
+        ExtrinsicsCheck(**wrong)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hal.base.messages import Intrinsics
-from z1_runtime.perception.occlusion import REACH_M, hidden_points
+from z1_runtime.perception.occlusion import REACH_M, occluded_points
 
 INTRINSICS = Intrinsics(width=320, height=240, fx=400.0, fy=400.0, cx=159.5, cy=119.5)
 OBJECT_M, TABLE_M = 0.30, 0.45
@@ -26,13 +26,13 @@ def picture(gap: tuple[slice, slice] | None = None) -> tuple[np.ndarray, np.ndar
 
 def test_an_object_in_full_view_hides_nothing():
     depth, solid = picture()
-    assert hidden_points(depth, INTRINSICS, solid).shape == (0, 3)
-    assert hidden_points(depth, INTRINSICS, np.zeros_like(solid)).shape == (0, 3)
+    assert occluded_points(depth, INTRINSICS, solid).shape == (0, 3)
+    assert occluded_points(depth, INTRINSICS, np.zeros_like(solid)).shape == (0, 3)
 
 
 def test_behind_what_hides_its_side_the_object_goes_on_at_its_depth():
     depth, solid = picture((slice(60, 200), slice(160, 230)))
-    points = hidden_points(depth, INTRINSICS, solid)
+    points = occluded_points(depth, INTRINSICS, solid)
     edge_m = (159 - INTRINSICS.cx) * OBJECT_M / INTRINSICS.fx
     assert points[:, 2] == pytest.approx(OBJECT_M)
     assert points[:, 0].min() == pytest.approx(edge_m, abs=2e-3)
@@ -41,9 +41,9 @@ def test_behind_what_hides_its_side_the_object_goes_on_at_its_depth():
 
 def test_a_gap_that_the_table_separates_from_the_object_hides_nothing_of_it():
     depth, solid = picture((slice(60, 200), slice(190, 230)))
-    assert hidden_points(depth, INTRINSICS, solid).shape == (0, 3)
+    assert occluded_points(depth, INTRINSICS, solid).shape == (0, 3)
 
 
 def test_the_thin_shadow_that_stereo_leaves_beside_an_edge_is_no_hiding_place():
     depth, solid = picture((ROWS, slice(180, 190)))
-    assert hidden_points(depth, INTRINSICS, solid).shape == (0, 3)
+    assert occluded_points(depth, INTRINSICS, solid).shape == (0, 3)

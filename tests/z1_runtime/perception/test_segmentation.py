@@ -7,7 +7,7 @@ from scipy.spatial import KDTree
 from hal.base.transforms import transform_points
 from models.types import Detection
 from tests.support.tabletop_scene import INTRINSICS, Box, Cylinder, T_base_camera, cast, frame_of, noisy_frame, truth
-from z1_runtime.perception.detectors import TabletopDetector, TruthDetector, mask_box
+from z1_runtime.perception.detectors import GroundTruthDetector, TabletopDetector, mask_box
 from z1_runtime.perception.point_cloud import back_project
 from z1_runtime.perception.segmentation import (
     NoDepthError,
@@ -46,7 +46,7 @@ class Fixed:
         return self._detections
 
 
-@pytest.mark.parametrize("detector", [TabletopDetector(), TruthDetector()])
+@pytest.mark.parametrize("detector", [TabletopDetector(), GroundTruthDetector()])
 @pytest.mark.parametrize("target", [BOTTLE, BOX, Cylinder(0.56, 0.15, 0.0325, 0.2)])
 def test_the_objects_cloud_covers_the_object_and_nothing_else(target, detector):
     seen = make(detector).observe(noisy_frame([target]), T_base_camera(), JAW)
@@ -67,7 +67,7 @@ def test_the_objects_cloud_holds_no_table():
 
 def test_a_box_without_a_mask_gives_the_object_too_and_leaves_its_table_in_the_scene():
     frame = noisy_frame([BOX])
-    by_mask = make(TruthDetector()).observe(frame, T_base_camera(), JAW)
+    by_mask = make(GroundTruthDetector()).observe(frame, T_base_camera(), JAW)
     detection = Detection(label="box", confidence=0.8, box_px=mask_box(truth(frame)))
     by_box = make().segment(frame, T_base_camera(), JAW, detection)
     exact = surface([BOX])

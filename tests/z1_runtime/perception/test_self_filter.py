@@ -19,7 +19,7 @@ from tests.support.tabletop_scene import (
 from z1_runtime.perception.detectors import TabletopDetector
 from z1_runtime.perception.point_cloud import back_project
 from z1_runtime.perception.segmentation import NoDetectionError, Perception, PerceptionConfig
-from z1_runtime.perception.self_filter import OwnGripper
+from z1_runtime.perception.self_filter import SelfFilter
 
 JAW = -1.0
 BETWEEN_THE_JAWS = Box(0.32, -0.03, (0.02, 0.02, 0.30))
@@ -36,7 +36,7 @@ def test_every_pixel_of_the_gripper_is_blanked_at_any_opening(jaw):
     alone = gripper_depth(jaw)
     depth = np.where(np.isfinite(alone), alone, 0.0).astype(np.float32)
     assert (depth > 0).sum() > 2000
-    assert not OwnGripper().blanked(frame_of(depth), jaw).depth_m.any()
+    assert not SelfFilter().mask_gripper(frame_of(depth), jaw).depth_m.any()
 
 
 def test_a_hand_eye_error_of_5_mm_is_covered():
@@ -45,7 +45,7 @@ def test_a_hand_eye_error_of_5_mm_is_covered():
     shift = round(0.005 * INTRINSICS.fx / float(np.median(depth[depth > 0])))
     moved = np.roll(np.where(depth > 0, depth + 0.005, 0.0).astype(np.float32), shift, axis=1)
     moved[:, :shift] = 0.0
-    assert (OwnGripper().blanked(frame_of(moved), JAW).depth_m > 0).mean() < 1e-4
+    assert (SelfFilter().mask_gripper(frame_of(moved), JAW).depth_m > 0).mean() < 1e-4
 
 
 def test_what_stands_between_the_open_jaws_is_kept():
@@ -55,13 +55,13 @@ def test_what_stands_between_the_open_jaws_is_kept():
     # The fingertips are 0.2 m along the flange's x; the jaws open along its z
     between = (flange[:, 0] < 0.2) & (np.abs(flange[:, 1]) < 0.02) & (flange[:, 2] > 0.0) & (flange[:, 2] < 0.08)
     assert between.sum() > 100
-    kept = OwnGripper().blanked(frame_of(depth.astype(np.float32)), JAW).depth_m > 0
+    kept = SelfFilter().mask_gripper(frame_of(depth.astype(np.float32)), JAW).depth_m > 0
     assert kept[visible].mean() > 0.99
 
 
 def test_what_is_behind_the_jaws_is_kept():
     depth = cast([])[0].astype(np.float32)
-    behind = OwnGripper().blanked(frame_of(depth), JAW).depth_m
+    behind = SelfFilter().mask_gripper(frame_of(depth), JAW).depth_m
     np.testing.assert_array_equal(behind, depth)
 
 
@@ -84,4 +84,4 @@ def test_the_frame_that_is_shown_keeps_its_depth():
 
 def test_a_margin_that_makes_no_sense_is_refused():
     with pytest.raises(ValueError, match=r"margin_m is 0\.0"):
-        OwnGripper(margin_m=0.0)
+        SelfFilter(margin_m=0.0)

@@ -22,7 +22,7 @@ from tests.support.tabletop_scenes import (
 )
 from z1_runtime.collision.scene_collision import CollisionChecker
 from z1_runtime.geometry.kinematics import Kinematics
-from z1_runtime.grasping.grasp_candidates import Candidates
+from z1_runtime.grasping.grasp_candidates import GraspCandidates
 from z1_runtime.planning.planner import GraspPlanner, NoPlanError
 from z1_runtime.planning.planner_config import PlannerConfig
 from z1_runtime.types import Observation
@@ -185,7 +185,7 @@ def test_a_grasp_just_out_of_reach_is_planned_within_the_paper_s_tolerance(plann
     at_grasp = kinematics.pivot(plan.approach.q[-1, : z1.N_ARM])
     assert max(pose_error(at_grasp, plan.T_base_pivot)) < 1e-4
     checker = CollisionChecker(kinematics, observation, Q_START)
-    wished = Candidates(grasps, observation.T_base_camera, planner.gripper, checker, fallback_width_m=0.06).ways(0)
+    wished = GraspCandidates(grasps, observation.T_base_camera, planner.gripper, checker, fallback_width_m=0.06).ways(0)
     assert isinstance(wished, list)
     assert not any(kinematics.solve(way.T_base_pivot) for way in wished)
     errors = [pose_error(at_grasp, way.T_base_pivot) for way in wished]

@@ -10,7 +10,7 @@ from models.types import GraspSet
 from tests.support.tabletop_scenes import HEIGHT_M, Q_START, camera_pose, cylinder, frontal, in_camera, make_observation
 from z1_runtime.geometry.kinematics import Kinematics
 from z1_runtime.planning.planner import GraspPlanner
-from z1_runtime.planning.reachability_config import AbilityConfig
+from z1_runtime.planning.reachability_config import ReachabilityConfig
 from z1_runtime.types import Observation
 
 AT = (0.48, 0.0)
@@ -72,6 +72,6 @@ def test_the_first_in_that_order_is_the_one_that_is_executed(planner, observatio
 
 def test_weights_that_do_not_add_up_are_refused():
     with pytest.raises(ValueError, match="their sum must be 1"):
-        AbilityConfig(centring=0.9)
+        ReachabilityConfig(centring=0.9)
     with pytest.raises(ValueError, match="n_reached <= n_asked"):
-        AbilityConfig(n_reached=200)
+        ReachabilityConfig(n_reached=200)

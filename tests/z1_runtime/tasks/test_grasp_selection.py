@@ -14,20 +14,20 @@ from models.obb.obb import DegenerateCloudError
 from models.types import GraspSet
 from tests.support.tabletop_scene import frame_of
 from z1_runtime.config import RuntimeConfig
-from z1_runtime.factory import make_decider
+from z1_runtime.factory import make_grasp_selector
 from z1_runtime.perception import extrinsics_check
-from z1_runtime.perception.detectors import TruthDetector
+from z1_runtime.perception.detectors import GroundTruthDetector
 from z1_runtime.perception.segmentation import NoDepthError, NoDetectionError, PerceptionError
 from z1_runtime.planning.planner import NoPlanError
-from z1_runtime.tasks.grasp_selection import Decider, StageTimes, draw_can
+from z1_runtime.tasks.grasp_selection import GraspSelector, StageTimes, draw_can
 
 Q = np.append(z1.Q_HOME, -1.0)
 CONFIG = RuntimeConfig(detector="tabletop", generator="antipodal", n_candidates=300)
 
 
 @pytest.fixture(scope="module")
-def decider() -> Decider:
-    return make_decider(CONFIG)
+def decider() -> GraspSelector:
+    return make_grasp_selector(CONFIG)
 
 
 @pytest.fixture(scope="module")
@@ -54,9 +54,9 @@ class Spoiled:
         return replace(observation, object_points=self._spoil(observation.object_points.copy()))
 
 
-def with_part(decider: Decider, **part) -> Decider:
+def with_part(decider: GraspSelector, **part) -> GraspSelector:
     parts = {name: getattr(decider, name) for name in ("kinematics", "perception", "generator", "planner", "config")}
-    return Decider(**(parts | part))
+    return GraspSelector(**(parts | part))
 
 
 def test_the_drawn_can_is_the_can_it_says_it_is(decision, T_base_camera):
@@ -111,10 +111,10 @@ def test_an_empty_table_is_told(decider, T_base_camera):
 
 
 def test_a_detector_that_needs_the_twin_is_told_apart(decider, T_base_camera):
-    blind = make_decider(replace(CONFIG, detector="truth"))
-    assert isinstance(blind.perception._detector, TruthDetector)
+    blind = make_grasp_selector(replace(CONFIG, detector="truth"))
+    assert isinstance(blind.perception._detector, GroundTruthDetector)
     with pytest.raises(PerceptionError, match="--detector tabletop"):
-        blind.decide(replace(draw_can(T_base_camera), truth_mask=None), Q)
+        blind.decide(replace(draw_can(T_base_camera), ground_truth_mask=None), Q)
 
 
 def nan_in_the_middle(points: np.ndarray) -> np.ndarray:
@@ -161,7 +161,7 @@ def test_candidates_that_all_come_from_behind_leave_no_plan(decider, decision, T
 @pytest.mark.parametrize("detector", ["yolo", "tabletop", "truth"])
 def test_warming_up_decides_without_a_camera_whichever_the_detector(detector, caplog):
     with caplog.at_level("INFO", "z1_runtime.tasks.grasp_selection"):
-        make_decider(replace(RuntimeConfig(), detector=detector)).warm_up()
+        make_grasp_selector(replace(RuntimeConfig(), detector=detector)).warm_up()
     assert not caplog.records
 
 
@@ -173,7 +173,7 @@ def test_warming_up_reads_the_jaws_meshes_though_no_jaws_are_drawn(decider):
 
 def test_a_configuration_that_cannot_grasp_the_warm_up_scene_is_told_at_the_real_one(T_base_camera, caplog):
     config = RuntimeConfig(detector="tabletop", generator="antipodal")
-    high = make_decider(replace(config, planner=replace(config.planner, lift_m=0.5)))
+    high = make_grasp_selector(replace(config, planner=replace(config.planner, lift_m=0.5)))
     with caplog.at_level("INFO", "z1_runtime.tasks.grasp_selection"):
         high.warm_up()
     assert "no plan" in caplog.text

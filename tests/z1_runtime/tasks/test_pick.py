@@ -14,19 +14,19 @@ from hal.base.messages import RgbdFrame
 from tests.support.lockstep import Bench
 from tests.support.tabletop_scene import frame_of
 from z1_runtime.config import RuntimeConfig
-from z1_runtime.factory import make_decider
+from z1_runtime.factory import make_grasp_selector
 from z1_runtime.motion.executor import MotionError
 from z1_runtime.perception.segmentation import NoDepthError, NoDetectionError
-from z1_runtime.tasks.grasp_selection import Decider, draw_can
-from z1_runtime.tasks.pick import PickPipeline
-from z1_runtime.visualization.rerun_logger import Inspector
+from z1_runtime.tasks.grasp_selection import GraspSelector, draw_can
+from z1_runtime.tasks.pick import PickTask
+from z1_runtime.visualization.rerun_logger import RerunLogger
 
 CONFIG = RuntimeConfig(detector="tabletop", generator="antipodal", n_candidates=300, hold_s=0.2, frame_timeout_s=0.5)
 Q_LOOK = np.append(z1.Q_HOME, CONFIG.jaw_home)
 PHASES = ["home", "look", "decide", "transfer", "approach", "close", "lift", "hold"]
 
 
-class Lane(Inspector):
+class Lane(RerunLogger):
     """An inspector that only remembers the names of the phases."""
 
     def __init__(self) -> None:
@@ -40,14 +40,14 @@ class Lane(Inspector):
 class Cell:
     """An arm, a camera that shows `frame`, and a pipeline; `after` is called with the name of each phase that ended."""
 
-    def __init__(self, decider: Decider, frame: RgbdFrame, q_start: np.ndarray = Q_LOOK) -> None:
+    def __init__(self, decider: GraspSelector, frame: RgbdFrame, q_start: np.ndarray = Q_LOOK) -> None:
         self.bench = Bench(q_start)
         camera = ReplayCamera([frame], clock=self.bench.clock)
         camera.connect()
         self.after = lambda name: None
         self.ended: list[str] = []
         self.lane = Lane()
-        self.pipeline = PickPipeline(
+        self.pipeline = PickTask(
             decider=decider,
             arm=self.bench.servo,
             camera=camera,
@@ -67,8 +67,8 @@ class Cell:
 
 
 @pytest.fixture(scope="module")
-def decider() -> Decider:
-    return make_decider(CONFIG)
+def decider() -> GraspSelector:
+    return make_grasp_selector(CONFIG)
 
 
 @pytest.fixture(scope="module")

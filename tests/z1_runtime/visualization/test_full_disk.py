@@ -11,7 +11,7 @@ import pytest
 
 from hal.base.messages import Intrinsics, RgbdFrame
 from tests.support.faults_table import FaultsTable
-from z1_runtime.visualization.rerun_logger import Inspector
+from z1_runtime.visualization.rerun_logger import RerunLogger
 
 K = Intrinsics(width=320, height=240, fx=300.0, fy=300.0, cx=159.5, cy=119.5)
 ROOM = 2**20
@@ -43,7 +43,7 @@ def test_a_disk_that_fills_up_ends_the_recording_and_not_the_pick(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, faults_table: FaultsTable
 ) -> None:
     out = tmp_path / "episode.rrd"
-    inspector = Inspector(out, max_frames=100)
+    inspector = RerunLogger(out, max_frames=100)
     frames = 20
     for n in range(frames):
         inspector.log_frame(noisy_frame(n), np.eye(4))
@@ -61,5 +61,5 @@ def test_a_disk_that_fills_up_ends_the_recording_and_not_the_pick(
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="Linux has a disk that is always full")
 def test_a_disk_that_is_full_at_the_start_is_one_clear_error(faults_table: FaultsTable) -> None:
     with pytest.raises(OSError, match=r"/dev/full cannot be written.*No space left on device") as caught:
-        Inspector(Path("/dev/full"))
+        RerunLogger(Path("/dev/full"))
     faults_table.add("disk full before recording", arm="is not touched", reads=caught.value)

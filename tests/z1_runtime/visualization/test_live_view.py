@@ -14,14 +14,14 @@ from hal.base import z1
 from hal.base.clock import WallClock
 from hal.base.messages import RgbdFrame
 from z1_runtime.geometry.kinematics import Kinematics
-from z1_runtime.visualization.live_view import FrameTap
-from z1_runtime.visualization.rerun_logger import Inspector
+from z1_runtime.visualization.live_view import LiveView
+from z1_runtime.visualization.rerun_logger import RerunLogger
 
 Q = np.array([0.3, 1.2, -0.4, -0.3, 0.1, 1.2, -0.5])
 PATIENCE_S = 20.0
 
 
-class Album(Inspector):
+class Album(RerunLogger):
     """An inspector that keeps what it is shown."""
 
     def __init__(self, wanted: int) -> None:
@@ -50,7 +50,7 @@ def threads() -> list[str]:
 def test_frames_are_shown_with_the_camera_s_pose_and_the_thread_ends_with_the_block(arm):
     camera, album = ReplayCamera(), Album(3)
     camera.connect()
-    with FrameTap(camera, arm, album, rate_hz=200.0):
+    with LiveView(camera, arm, album, rate_hz=200.0):
         assert album.full.wait(PATIENCE_S)
     assert "frame tap" not in threads()
     sequences = [frame.sequence for frame, _ in album.seen]
@@ -61,7 +61,7 @@ def test_frames_are_shown_with_the_camera_s_pose_and_the_thread_ends_with_the_bl
 
 def test_a_camera_that_fails_ends_the_showing_with_a_warning_and_nothing_else(arm, caplog):
     camera, album = ReplayCamera(loop=False), Album(1)  # never connected
-    tap = FrameTap(camera, arm, album, rate_hz=200.0)
+    tap = LiveView(camera, arm, album, rate_hz=200.0)
     with caplog.at_level(logging.WARNING), tap:
         tap._thread.join(PATIENCE_S)
         assert not tap._thread.is_alive()
@@ -72,7 +72,7 @@ def test_a_camera_that_fails_ends_the_showing_with_a_warning_and_nothing_else(ar
 def test_an_arm_that_fails_ends_the_showing_too(caplog):
     camera, album = ReplayCamera(), Album(1)
     camera.connect()
-    tap = FrameTap(camera, MockArm(WallClock()), album, rate_hz=200.0)
+    tap = LiveView(camera, MockArm(WallClock()), album, rate_hz=200.0)
     with caplog.at_level(logging.WARNING), tap:
         tap._thread.join(PATIENCE_S)
         assert not tap._thread.is_alive()

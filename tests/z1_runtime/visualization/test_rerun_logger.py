@@ -23,7 +23,7 @@ from z1_runtime.types import GraspPlan, JointTrajectory, Observation, Plane, Rej
 from z1_runtime.visualization import blueprint
 from z1_runtime.visualization.archetypes import gripper_strips
 from z1_runtime.visualization.recorder import Recorder, ViewerPortError
-from z1_runtime.visualization.rerun_logger import Inspector
+from z1_runtime.visualization.rerun_logger import RerunLogger
 from z1_runtime.visualization.robot_view import RobotDrawing
 
 K = Intrinsics(width=64, height=48, fx=60.0, fy=60.0, cx=31.5, cy=23.5)
@@ -94,7 +94,7 @@ def make_grasps(n: int) -> GraspSet:
     )
 
 
-def log_everything(inspector: Inspector) -> None:
+def log_everything(inspector: RerunLogger) -> None:
     box = OrientedBox(
         T_camera_box=np.eye(4), half_extents_m=np.array([0.03, 0.04, 0.1]), unobserved=np.zeros(3, dtype=bool)
     )
@@ -135,7 +135,7 @@ def held_worker(monkeypatch: pytest.MonkeyPatch):
 
 def test_recording_holds_every_kind_of_entry(tmp_path: Path) -> None:
     path = tmp_path / "deep" / "episode.rrd"
-    inspector = Inspector(path)
+    inspector = RerunLogger(path)
     log_everything(inspector)
     inspector.close()
     rows = read_entities(path)
@@ -149,7 +149,7 @@ def test_recording_holds_every_kind_of_entry(tmp_path: Path) -> None:
 
 def test_recording_holds_the_layout(tmp_path: Path) -> None:
     path = tmp_path / "episode.rrd"
-    inspector = Inspector(path)
+    inspector = RerunLogger(path)
     inspector.close()
     reader = RrdReader(path)
     (layout,) = reader.blueprints()
@@ -159,7 +159,7 @@ def test_recording_holds_the_layout(tmp_path: Path) -> None:
 
 def test_times_are_those_of_the_messages(tmp_path: Path) -> None:
     path = tmp_path / "episode.rrd"
-    inspector = Inspector(path)
+    inspector = RerunLogger(path)
     inspector.log_phase("look", 12.5)
     inspector.log_stage_times({"total": 1.0})  # carries no time: takes the newest
     inspector.close()
@@ -172,7 +172,7 @@ def test_times_are_those_of_the_messages(tmp_path: Path) -> None:
 
 def test_full_queue_drops_oldest_frames_first_and_keeps_the_rest(tmp_path: Path, held_worker: threading.Event) -> None:
     path = tmp_path / "episode.rrd"
-    inspector = Inspector(path, max_frames=2, max_jobs=50)
+    inspector = RerunLogger(path, max_frames=2, max_jobs=50)
     for step in range(40):
         inspector.log_frame(make_frame(float(step)), np.eye(4))
         inspector.log_phase(f"phase {step}", float(step))
@@ -186,7 +186,7 @@ def test_full_queue_drops_oldest_frames_first_and_keeps_the_rest(tmp_path: Path,
 
 
 def test_caller_goes_on_when_the_worker_hangs(tmp_path: Path, held_worker: threading.Event) -> None:
-    inspector = Inspector(tmp_path / "episode.rrd", max_jobs=10)
+    inspector = RerunLogger(tmp_path / "episode.rrd", max_jobs=10)
     for step in range(25):
         inspector.log_phase("busy", float(step))
     assert inspector.lost == 15
@@ -194,7 +194,7 @@ def test_caller_goes_on_when_the_worker_hangs(tmp_path: Path, held_worker: threa
 
 
 def test_fault_in_a_drawing_ends_the_recording_not_the_caller(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    inspector = Inspector(tmp_path / "episode.rrd")
+    inspector = RerunLogger(tmp_path / "episode.rrd")
     inspector.log_stage_times({"total": "no number"})  # pyright: ignore[reportArgumentType]
     inspector.close()
     assert "the recording ends here" in caplog.text
@@ -202,7 +202,7 @@ def test_fault_in_a_drawing_ends_the_recording_not_the_caller(tmp_path: Path, ca
 
 def test_faster_frames_than_wanted_are_thinned_by_their_stamps(tmp_path: Path) -> None:
     path = tmp_path / "episode.rrd"
-    inspector = Inspector(path, frame_rate_hz=5.0, max_frames=100)
+    inspector = RerunLogger(path, frame_rate_hz=5.0, max_frames=100)
     for step in range(60):
         inspector.log_frame(make_frame(step / 30), np.eye(4))
     inspector.close()
@@ -212,7 +212,7 @@ def test_faster_frames_than_wanted_are_thinned_by_their_stamps(tmp_path: Path) -
 
 def test_inspector_without_sinks_does_nothing() -> None:
     before = threading.active_count()
-    inspector = Inspector()
+    inspector = RerunLogger()
     log_everything(inspector)
     assert threading.active_count() == before
     inspector.close()
@@ -242,7 +242,7 @@ def test_live_view_listens_on_the_loopback_only(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     port = free_port()
-    inspector = Inspector(live=True, port=port)
+    inspector = RerunLogger(live=True, port=port)
     with socket.create_connection(("127.0.0.1", port), timeout=20):
         assert listening_addresses(port) == {"0100007F"}
     inspector.close()
@@ -254,7 +254,7 @@ def test_taken_port_is_one_clear_error() -> None:
         other.listen()
         port = other.getsockname()[1]
         with pytest.raises(ViewerPortError, match=str(port)):
-            Inspector(live=True, port=port)
+            RerunLogger(live=True, port=port)
 
 
 def test_drawn_pivot_is_where_the_kinematics_put_it() -> None:
@@ -275,7 +275,7 @@ def test_viewer_opens_where_there_is_a_screen_and_stays_on_the_loopback(monkeypa
     monkeypatch.setenv("DISPLAY", ":0")
     monkeypatch.setattr("subprocess.Popen", lambda command, **more: started.append(command))
     port = free_port()
-    Inspector(live=True, port=port).close()
+    RerunLogger(live=True, port=port).close()
     (command,) = started
     assert command[command.index("--bind") + 1] == "127.0.0.1"
     assert command[-1] == f"rerun+http://127.0.0.1:{port}/proxy"

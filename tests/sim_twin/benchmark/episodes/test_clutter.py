@@ -74,8 +74,8 @@ def test_a_detector_without_classes_is_pointed_at_the_object(lateral):
     T_base_camera = Kinematics().flange(q[:6]) @ scenario.scene().T_flange_camera()
     assert len(TabletopDetector().detect(frame, T_base_camera)) > 1
     (found,) = detector.detect(frame, T_base_camera)
-    assert overlap(found, frame.truth_mask) > 0.6
-    gone = replace(frame, truth_mask=np.zeros_like(frame.truth_mask))
+    assert overlap(found, frame.ground_truth_mask) > 0.6
+    gone = replace(frame, ground_truth_mask=np.zeros_like(frame.ground_truth_mask))
     assert detector.detect(gone, T_base_camera) == []
 
 

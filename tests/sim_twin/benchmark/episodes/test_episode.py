@@ -10,7 +10,7 @@ from sim_twin.benchmark.episodes.scenarios import Scenario
 from sim_twin.benchmark.episodes.trial import Mode, Robot, look
 from sim_twin.model.scene import SceneConfig
 from z1_runtime.config import RuntimeConfig
-from z1_runtime.factory import make_decider
+from z1_runtime.factory import make_grasp_selector
 from z1_runtime.grasping.features import FEATURES
 
 CONFIG = RuntimeConfig(generator="antipodal", detector="tabletop", n_candidates=400)
@@ -19,7 +19,7 @@ SCENARIO = Scenario(object="cylinder", distance="mid", lateral="centre", pitch_d
 
 @pytest.fixture(scope="module")
 def decider():
-    return make_decider(CONFIG)
+    return make_grasp_selector(CONFIG)
 
 
 @pytest.fixture(scope="module")

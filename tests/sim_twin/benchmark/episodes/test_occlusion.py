@@ -16,11 +16,11 @@ def frame():
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_the_asked_share_of_the_object_is_hidden_in_mask_and_depth(frame, share, seed):
     hidden = occlude(frame, share, seed)
-    left = hidden.truth_mask.sum() / frame.truth_mask.sum()
+    left = hidden.ground_truth_mask.sum() / frame.ground_truth_mask.sum()
     assert left == pytest.approx(1.0 - share, abs=0.02)
-    gone = frame.truth_mask & ~hidden.truth_mask
+    gone = frame.ground_truth_mask & ~hidden.ground_truth_mask
     assert not hidden.depth_m[gone].any()
-    assert np.array_equal(hidden.depth_m[hidden.truth_mask], frame.depth_m[hidden.truth_mask])
+    assert np.array_equal(hidden.depth_m[hidden.ground_truth_mask], frame.depth_m[hidden.ground_truth_mask])
 
 
 def test_most_of_the_table_stays_in_view(frame):

@@ -11,7 +11,7 @@ from sim_twin.benchmark.episodes.methods import parse_method
 from sim_twin.benchmark.episodes.recordings import Recordings
 from sim_twin.benchmark.episodes.scenarios import Scenario
 from z1_runtime.config import RuntimeConfig
-from z1_runtime.factory import make_decider
+from z1_runtime.factory import make_grasp_selector
 from z1_runtime.visualization import blueprint
 
 SCENARIO = Scenario(object="cylinder", distance="mid", lateral="centre", pitch_deg=0.0)
@@ -20,7 +20,7 @@ METHODS = [parse_method("vanilla:collision_filter=no")]
 
 @pytest.fixture(scope="module")
 def decider():
-    return make_decider(RuntimeConfig(generator="antipodal", detector="tabletop", n_candidates=400))
+    return make_grasp_selector(RuntimeConfig(generator="antipodal", detector="tabletop", n_candidates=400))
 
 
 def entities(path):

@@ -10,7 +10,7 @@ from sim_twin.benchmark.episodes.methods import METHODS
 from sim_twin.benchmark.episodes.scenarios import Scenario
 from sim_twin.benchmark.episodes.trial import Mode, Outcome, Robot, look
 from z1_runtime.config import RuntimeConfig
-from z1_runtime.factory import make_decider
+from z1_runtime.factory import make_grasp_selector
 
 SCENARIO = Scenario(object="cylinder", distance="mid", lateral="centre", pitch_deg=0.0)
 MVB = METHODS["mvb"]
@@ -18,7 +18,7 @@ MVB = METHODS["mvb"]
 
 @pytest.fixture(scope="module")
 def decider():
-    return make_decider(RuntimeConfig(generator="antipodal", detector="tabletop", n_candidates=300))
+    return make_grasp_selector(RuntimeConfig(generator="antipodal", detector="tabletop", n_candidates=300))
 
 
 class Grasped:

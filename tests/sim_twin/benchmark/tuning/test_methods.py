@@ -7,10 +7,10 @@ import pytest
 
 from hal.base import z1
 from sim_twin.benchmark.episodes.methods import METHODS, file_name, parse_method
-from sim_twin.benchmark.episodes.seen import Seen
+from sim_twin.benchmark.episodes.seen import SharedObservation
 from sim_twin.benchmark.results.store import Store
 from z1_runtime.config import RuntimeConfig
-from z1_runtime.factory import make_decider
+from z1_runtime.factory import make_grasp_selector
 from z1_runtime.grasping.ranking import Ranking, Scoring, ScoringError, ScoringHead, save_scoring
 from z1_runtime.tasks.grasp_selection import StageTimes, draw_can
 
@@ -30,13 +30,13 @@ def file(tmp_path):
 
 @pytest.fixture(scope="module")
 def decider():
-    return make_decider(RuntimeConfig(detector="tabletop", n_candidates=200))
+    return make_grasp_selector(RuntimeConfig(detector="tabletop", n_candidates=200))
 
 
 @pytest.fixture(scope="module")
 def seen(decider):
     frame = draw_can(decider.kinematics.flange(z1.Q_HOME) @ z1.T_FLANGE_CAMERA)
-    return Seen.by(decider, frame, Q, StageTimes())
+    return SharedObservation.by(decider, frame, Q, StageTimes())
 
 
 def order(text, seen, decider):
