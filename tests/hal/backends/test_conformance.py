@@ -12,7 +12,7 @@ from hal.base.camera import Camera
 from hal.base.errors import HalTimeoutError, NotConnectedError
 from hal.base.messages import ArmSetpoint
 from hal.base.z1 import N_ARM, N_JOINTS, Q_MAX, Q_MIN
-from tests.support.conformance import ARM_CASES, CAMERA_CASES, ArmCase, CameraCase, drive
+from tests.support.hal.conformance import ARM_CASES, CAMERA_CASES, ArmCase, CameraCase, drive
 
 
 @pytest.fixture(params=[make for _, make in ARM_CASES], ids=[name for name, _ in ARM_CASES])

@@ -13,7 +13,7 @@ from hal.bus.client import RemoteArm, RemoteCamera
 from hal.bus.server import HalServer
 from hal.servo.servo import Servo
 from hal.servo.servo_thread import ServoThread
-from tests.support.bus_hal import Hal, free_config
+from tests.support.hal.bus_hal import Hal, free_config
 
 
 @pytest.fixture

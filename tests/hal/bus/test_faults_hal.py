@@ -16,8 +16,8 @@ from sim_twin.drop_in.rig import free_ports
 from sim_twin.drop_in.udp_server import WireServer
 from sim_twin.model.scene import SceneConfig
 from sim_twin.model.world import World
-from tests.support.bus_hal import end_processes, free_config, moving, set_off, start_python, wait_until
 from tests.support.faults_table import FaultsTable
+from tests.support.hal.bus_hal import end_processes, free_config, moving, set_off, start_python, wait_until
 
 SERVE = """
 import sys

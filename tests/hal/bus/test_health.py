@@ -8,7 +8,7 @@ from hal.base.clock import WallClock
 from hal.base.errors import HalTimeoutError
 from hal.base.messages import ServoMode
 from hal.bus.health import describe_health, wait_for_health
-from tests.support.bus_hal import free_config, wait_until
+from tests.support.hal.bus_hal import free_config, wait_until
 
 
 def test_the_health_of_a_servo_is_what_its_thread_measured(hal, remote_arm):

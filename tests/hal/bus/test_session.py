@@ -10,7 +10,7 @@ import pytest
 from hal.base.errors import HalError, HalTimeoutError
 from hal.bus.client import RemoteArm, RemoteCamera
 from hal.bus.session import BusConfig, open_session
-from tests.support.bus_hal import free_config
+from tests.support.hal.bus_hal import free_config
 
 
 @pytest.mark.parametrize(

@@ -14,15 +14,15 @@ from hal.base.clock import WallClock
 from hal.base.errors import HalTimeoutError
 from hal.base.messages import ArmSetpoint, ServoMode
 from hal.bus.client import RemoteArm, RemoteCamera
-from tests.support.bus_hal import end_processes, free_config, moving, set_off, start_python, wait_until
 from tests.support.faults_table import FaultsTable, describe
+from tests.support.hal.bus_hal import end_processes, free_config, moving, set_off, start_python, wait_until
 
 BRAKED_WITHIN_S = 0.4
 """The safety requirement: from the death of the commanding process to the arm at rest [s]."""
 
 MOVE = """
 import sys
-from tests.support.bus_hal import slow_motion
+from tests.support.hal.bus_hal import slow_motion
 from threading import Event
 from hal.bus.client import RemoteArm, BusConfig
 arm = RemoteArm(BusConfig(port=int(sys.argv[1])), owner="mortal")

@@ -10,7 +10,7 @@ from hal.base.z1 import CONTROL_PERIOD_S, DDQ_MAX, DQ_MAX, N_JOINTS, Q_MAX, Q_MI
 from hal.servo.braking import Blend, Brake, Chaser, plan_path_stop
 from hal.servo.limits import ServoLimits
 from hal.servo.trajectory_buffer import Playback
-from tests.support.servo_bench import START, Bench
+from tests.support.hal.servo_bench import START, Bench
 
 LIMITS = ServoLimits()
 MIDDLE = (Q_MIN + Q_MAX) / 2

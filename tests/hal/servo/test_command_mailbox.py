@@ -9,7 +9,7 @@ from hal.base.errors import CommandRejectedError, LeaseError, NotConnectedError
 from hal.base.messages import ServoMode, TrajectoryChunk
 from hal.base.z1 import CONTROL_PERIOD_S, DDQ_MAX
 from hal.servo.trajectory_buffer import MAX_POINTS
-from tests.support.servo_bench import ARM, START, STEP, Bench, move, setpoint
+from tests.support.hal.servo_bench import ARM, START, STEP, Bench, move, setpoint
 
 HOLDING = ServoMode.HOLDING
 

@@ -13,7 +13,7 @@ from hal.base.messages import ServoMode, TrajectoryChunk
 from hal.base.z1_shape import GRIPPER_POINTS
 from hal.servo.guard import Guard, Workspace
 from hal.servo.guard_kernels import segment_distance
-from tests.support.servo_bench import START, Bench, move, setpoint
+from tests.support.hal.servo_bench import START, Bench, move, setpoint
 
 HOME = np.append(z1.Q_HOME, -1.0)
 FOLDED = np.zeros(z1.N_JOINTS)

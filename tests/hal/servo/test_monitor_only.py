@@ -11,7 +11,7 @@ from hal.base.errors import CommandRejectedError, LeaseError
 from hal.base.messages import ArmSetpoint, ServoMode
 from hal.base.z1 import CONTROL_PERIOD_S
 from hal.servo.monitor_only import ReadonlyServo
-from tests.support.servo_bench import START, move, setpoint
+from tests.support.hal.servo_bench import START, move, setpoint
 
 
 class HandledArm(MockArm):

@@ -12,7 +12,7 @@ from hal.base.errors import CommandRejectedError, HalTimeoutError, LeaseError, S
 from hal.base.messages import ServoMode, TrajectoryChunk
 from hal.base.z1 import CONTROL_PERIOD_S, DDQ_MAX, DQ_MAX, KP, N_ARM, N_JOINTS, Q_MAX, Q_MIN, TAU_MAX
 from hal.servo.limits import ServoLimits
-from tests.support.servo_bench import ARM, RAMP_S, START, STEP, Bench, cruise, move, setpoint
+from tests.support.hal.servo_bench import ARM, RAMP_S, START, STEP, Bench, cruise, move, setpoint
 
 HOLDING, TRACKING, BRAKING, STOPPED = ServoMode.HOLDING, ServoMode.TRACKING, ServoMode.BRAKING, ServoMode.STOPPED
 

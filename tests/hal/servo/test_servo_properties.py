@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hal.base.errors import HalError
 from hal.base.messages import TrajectoryChunk
 from hal.base.z1 import CONTROL_PERIOD_S, DQ_MAX, N_JOINTS, Q_MAX, Q_MIN
-from tests.support.servo_bench import START, Bench, setpoint
+from tests.support.hal.servo_bench import START, Bench, setpoint
 
 joints = st.lists(st.floats(-1, 1), min_size=N_JOINTS, max_size=N_JOINTS).map(np.array)
 chunks = st.tuples(

@@ -13,7 +13,7 @@ from hal.base.messages import ServoMode
 from hal.base.z1 import CONTROL_PERIOD_S, N_ARM
 from hal.servo.servo import Servo
 from hal.servo.servo_thread import ServoThread
-from tests.support.servo_bench import START, STEP, move
+from tests.support.hal.servo_bench import START, STEP, move
 
 
 class CountingServo:

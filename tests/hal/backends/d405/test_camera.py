@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from tests.support.faults_table import FaultsTable
-from tests.support.plain_source import PlainSource, pinhole_rays, tint, tint_slope
+from tests.support.hal.plain_source import PlainSource, pinhole_rays, tint, tint_slope
 
 if find_spec("pyrealsense2") is None:
     pytest.skip("pyrealsense2 has no wheel for this platform", allow_module_level=True)

@@ -20,7 +20,7 @@ from hal.servo.servo import Servo
 from hal.z1_protocol.controller import COMMAND_SIZE, LABELS, STATE_SIZE, TrajectoryCommand
 from hal.z1_protocol.records import MotorError, MotorLink
 from hal.z1_protocol.states import Fsm
-from tests.support.z1_peer import FakeController, MemoryLink, gripper_model, mangled
+from tests.support.hal.z1_peer import FakeController, MemoryLink, gripper_model, mangled
 
 REST = np.zeros(z1.N_JOINTS)
 PERIOD_S = z1.CONTROL_PERIOD_S

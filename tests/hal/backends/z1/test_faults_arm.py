@@ -11,7 +11,7 @@ from hal.z1_protocol.controller import encode_command
 from hal.z1_protocol.records import MotorError, MotorLink
 from hal.z1_protocol.states import Fsm
 from tests.support.faults_table import FaultsTable
-from tests.support.wired_bench import WiredBench
+from tests.support.hal.wired_bench import WiredBench
 
 pytestmark = pytest.mark.faults
 

@@ -8,9 +8,9 @@ import pytest
 from hal.backends.z1.config import Z1Mode
 from hal.base.messages import ServoMode
 from hal.z1_protocol.controller import COMMAND_SIZE, STATE_SIZE
-from tests.support.bad_network import FATES, BadNetwork
 from tests.support.faults_table import FaultsTable
-from tests.support.wired_bench import WiredBench
+from tests.support.hal.bad_network import FATES, BadNetwork
+from tests.support.hal.wired_bench import WiredBench
 
 pytestmark = pytest.mark.faults
 

@@ -21,7 +21,7 @@ from hal.servo.servo import Servo
 from hal.servo.servo_thread import ServoThread
 from hal.z1_protocol.states import Fsm
 from tests.support.faults_table import FaultsTable
-from tests.support.z1_peer import FakeController, serving
+from tests.support.hal.z1_peer import FakeController, serving
 
 
 def resting_peer(shift: float = 0.0) -> FakeController:

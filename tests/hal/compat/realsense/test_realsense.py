@@ -15,7 +15,7 @@ import pytest
 
 from hal.base import d405
 from hal.base.clock import WallClock, unix_offset_s
-from tests.support.plain_source import WALL_UNITS, PlainSource, pictures
+from tests.support.hal.plain_source import WALL_UNITS, PlainSource, pictures
 
 if find_spec("pyrealsense2") is None:
     pytest.skip("pyrealsense2 has no wheel for this platform", allow_module_level=True)

@@ -18,7 +18,7 @@ from hal.base.errors import HalTimeoutError
 from hal.compat.unitree_arm_interface import ArmFSMState, ArmInterface
 from hal.z1_protocol.controller import LABELS
 from hal.z1_protocol.states import Fsm
-from tests.support.z1_peer import FakeController, MemoryLink, gripper_model, serving
+from tests.support.hal.z1_peer import FakeController, MemoryLink, gripper_model, serving
 
 FORWARD = LABELS["forward"]
 

@@ -31,7 +31,7 @@ from sim_twin.controller.controlled_world import ControlledWorld
 from sim_twin.drop_in.realsense_source import TwinSource
 from sim_twin.model.scene import SceneConfig
 from sim_twin.model.world import World
-from tests.support.z1_peer import FakeController, MemoryLink
+from tests.support.hal.z1_peer import FakeController, MemoryLink
 
 TWIN_Z1 = "z1 over the twin"
 

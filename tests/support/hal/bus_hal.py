@@ -21,7 +21,7 @@ from hal.bus.server import HalServer
 from hal.bus.session import BusConfig
 from hal.servo.servo import Servo
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 
 
 @dataclass

@@ -19,7 +19,7 @@ from sim_twin.controller.controlled_world import ControlledWorld
 from sim_twin.model.scene import SceneConfig
 from sim_twin.model.world import World
 from tests.support.faults_table import FaultsTable, describe
-from tests.support.z1_peer import MemoryLink
+from tests.support.hal.z1_peer import MemoryLink
 
 PERIOD_S = z1.CONTROL_PERIOD_S
 MOVE_S = 1.2
