@@ -15,8 +15,8 @@ from models.detector.runtimes import RUNTIMES
 from models.factory import Process, generator_for, split_generator_name
 from z1_runtime.grasping.ranking import Ranking, load_scoring
 from z1_runtime.motion.executor import ExecutorConfig
-from z1_runtime.perception.detectors import DETECTORS
-from z1_runtime.perception.segmentation import PerceptionConfig
+from z1_runtime.perception.config import PerceptionConfig
+from z1_runtime.perception.detectors.factory import DETECTORS
 from z1_runtime.planning.planner_config import PlannerConfig
 
 T = TypeVar("T")

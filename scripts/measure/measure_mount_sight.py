@@ -22,6 +22,7 @@ from hal.base.transforms import inverse
 from sim_twin.benchmark.episodes.scenarios import PAPER_OBJECTS, grid
 from sim_twin.benchmark.episodes.trial import look
 from z1_runtime.perception.extrinsics_check import ExtrinsicsCheck
+from z1_runtime.perception.self_filter import SelfFilter
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,7 +47,8 @@ def main(config: Config) -> None:
         scene = replace(poses[number * len(poses) // config.looks].scene(), seed=number, **off)
         frame, q = look(scene)
         watch = Stopwatch()
-        seen = sight.correct(frame, float(q[-1]), z1.T_FLANGE_CAMERA)
+        jaw = float(q[-1])
+        seen = sight.correct(frame, SelfFilter().gripper_pixels(frame, jaw), jaw, z1.T_FLANGE_CAMERA)
         times.append(watch.lap_ms())
         corrected += seen is not None
         believed = z1.T_FLANGE_CAMERA if seen is None else seen.T_flange_camera

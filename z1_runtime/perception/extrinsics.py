@@ -1,4 +1,4 @@
-"""Where the camera sits on the flange: from a calibration of this very camera, or else from the mount's drawing."""
+"""Extrinsics of the wrist camera: from a calibration of this very camera, or else from the mount's drawing."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ FOLDER_VARIABLE = "Z1_CALIBRATIONS"
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Extrinsics:
-    """The hand-eye transform in force and where it is from."""
+    """The hand-eye transform in force and its origin."""
 
     T_flange_camera: np.ndarray
     """(4, 4)."""
     origin: str
-    """One line for the operator: which file, of when, how good; or why the drawing's figures are taken."""
+    """One line for the operator: file, date and uncertainty; or why the drawing's figures are taken."""
 
 
 def results_folder(given: Path | None = None) -> Path:
-    """Return where results are kept: `given`, else $Z1_CALIBRATIONS, else z1-grasp/calibrations of the user's data."""
+    """Return the folder of results: `given`, else $Z1_CALIBRATIONS, else z1-grasp/calibrations in the user's data."""
     if given is not None:
         return given
     if named := os.environ.get(FOLDER_VARIABLE):
@@ -38,12 +38,12 @@ def results_folder(given: Path | None = None) -> Path:
 
 
 def find_extrinsics(serial: str, file: Path | None = None, folder: Path | None = None) -> Extrinsics:
-    """Return the mount of the camera `serial`; whatever is doubtful about it is logged as a warning.
+    """Return the extrinsics of the camera `serial`; quality warnings are logged.
 
     Args:
-        serial: of the camera; empty where it tells none, which then has no calibration of its own.
+        serial: of the camera; empty without one, which then has no calibration of its own.
         file: the result to use; None takes the newest valid one of this camera, or the drawing where there is none.
-        folder: where results are, as in `results_folder`.
+        folder: folder of the results, as in `results_folder`.
 
     Raises:
         ConfigError: `file` is missing or damaged, of another camera, or no hand-eye result of a wrist camera.
@@ -55,12 +55,12 @@ def find_extrinsics(serial: str, file: Path | None = None, folder: Path | None =
     except CalibrationError as error:
         if file is None and error.code == "missing_result":
             return _nominal(serial, folder)
-        raise ConfigError(str(error)) from error
+        raise ConfigError(str(error), code=error.code) from error
     return Extrinsics(T_flange_camera=T_flange_camera, origin=_origin(found))
 
 
 def _nominal(serial: str, folder: Path) -> Extrinsics:
-    whose = f"of camera {serial}" if serial else "of this camera, which tells no serial number,"
+    whose = f"of camera {serial}" if serial else "of this camera, which has no serial number,"
     return Extrinsics(
         T_flange_camera=z1.T_FLANGE_CAMERA,
         origin=f"the mount's drawing (no hand-eye calibration {whose} in {folder})",

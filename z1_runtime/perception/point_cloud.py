@@ -1,37 +1,50 @@
 """Point clouds from depth: back-projection and outlier filters, as pure functions.
 
 Clouds are (N, 3) in the camera's optical frame [m] unless a docstring says otherwise. Filters return what to keep as
-an (N,) bool, so that several can be chained without losing which pixel a point came from. Neighbour searches use
-SciPy's KD-tree.
+an (N,) bool, so that several can be chained without losing which pixel a point came from.
+
+Open3D does back-projection (4.9 ms for 286,000 points; NumPy 6.1) and the statistical filter (17 ms for 6,000; SciPy's
+KD-tree 24), with identical results. Its radius filter takes 54 ms where one k-th neighbour query takes 13; its voxel
+filter is as fast as ours (0.7 ms), but its grid begins at the cloud's own corner and its order is that of a hash table;
+its plane segmentation cannot bound the tilt, and takes 46 ms for the 128 hypotheses that `table_plane` tests in 7
+(medians on two cores of a Xeon, measured on a bottle at 0.45 m).
 """
 
 from __future__ import annotations
 
+from types import ModuleType
+
 import numpy as np
 from scipy.spatial import KDTree
 
-from hal.base.errors import InvalidValueError, Z1Error
+from hal.base.errors import InvalidValueError
 from hal.base.messages import Intrinsics
 
 
-class PerceptionError(Z1Error, RuntimeError):
-    """Root of all errors of perception."""
+def load_open3d() -> ModuleType:
+    """Return Open3D; the first call takes about a second."""
+    from hal.libusb import preload
 
-    default_code = "perception"
+    preload()  # its wheel links against libusb without bringing it
+    import open3d
+
+    return open3d
 
 
-def checked(points: np.ndarray) -> np.ndarray:
+def check_cloud(points: np.ndarray) -> np.ndarray:
     """Return `points` as an array.
 
     Raises:
-        ValueError: its shape is not (N, 3), or it is not finite.
+        InvalidValueError: its shape is not (N, 3), or it is not finite.
     """
     points = np.asarray(points)
     if points.ndim != 2 or points.shape[1] != 3:
-        raise InvalidValueError(f"a cloud has shape (N, 3); got {points.shape}.")
+        raise InvalidValueError(f"a cloud has shape (N, 3); got {points.shape}.", code="cloud_shape")
     if not np.isfinite(points).all():
         bad = int((~np.isfinite(points).all(axis=1)).sum())
-        raise InvalidValueError(f"{bad} of {len(points)} points are not finite; drop them before filtering.")
+        raise InvalidValueError(
+            f"{bad} of {len(points)} points are not finite; drop them before filtering.", code="not_finite"
+        )
     return points
 
 
@@ -39,19 +52,19 @@ def checked(points: np.ndarray) -> np.ndarray:
 
 
 def valid_pixels(depth_m: np.ndarray, d_max_m: float) -> np.ndarray:
-    """Return the (H, W) bool pixels with 0 < d ≤ d_max; 0 is the camera's word for "no measurement"."""
+    """Return the (H, W) bool pixels with 0 < d ≤ d_max; 0 is "no measurement"."""
     return (depth_m > 0) & (depth_m <= d_max_m)
 
 
 def continuous_pixels(depth_m: np.ndarray, step_ratio: float = 0.03, min_neighbours: int = 3) -> np.ndarray:
     """Return the (H, W) bool pixels whose depth continues in at least `min_neighbours` of their 8 neighbours.
 
-    Stereo interpolates between foreground and background at an edge; such flying pixels lie alone in between.
-    Two depths continue each other when they differ by less than `step_ratio` of the smaller.
+    Stereo interpolates between foreground and background at an edge; such flying pixels are isolated in between.
+    Two depths are continuous when they differ by less than `step_ratio` of the smaller.
     """
     height, width = depth_m.shape
     count = np.zeros((height, width), np.uint8)
-    tolerance = step_ratio * depth_m  # 0 where nothing was measured, so that a hole continues nobody
+    tolerance = step_ratio * depth_m  # 0 where nothing was measured, so that a hole is continuous with no neighbour
     everything, lower, upper = slice(None), slice(1, None), slice(None, -1)
     for rows_a, rows_b, columns_a, columns_b in (
         (everything, everything, lower, upper),
@@ -67,15 +80,20 @@ def continuous_pixels(depth_m: np.ndarray, step_ratio: float = 0.03, min_neighbo
 
 
 def back_project(depth_m: np.ndarray, intrinsics: Intrinsics, pixels: np.ndarray) -> np.ndarray:
-    """Return the (N, 3) points of the (H, W) bool `pixels`, row by row.
+    """Return the (N, 3) points of the (H, W) bool `pixels` that have depth, row by row.
 
     Raises:
         ValueError: depth and pixels differ in shape.
     """
     if depth_m.shape != pixels.shape:
-        raise InvalidValueError(f"depth {depth_m.shape} and pixels {pixels.shape} must have the same shape.")
-    v, u = np.nonzero(pixels)
-    return intrinsics.deproject(u, v, depth_m[pixels])
+        raise InvalidValueError(
+            f"depth {depth_m.shape} and pixels {pixels.shape} must have the same shape.", code="image_shape"
+        )
+    o3d, i = load_open3d(), intrinsics
+    pinhole = o3d.camera.PinholeCameraIntrinsic(i.width, i.height, i.fx, i.fy, i.cx, i.cy)
+    depth = o3d.geometry.Image(np.where(pixels, depth_m, 0.0).astype(np.float32))
+    cloud = o3d.geometry.PointCloud.create_from_depth_image(depth, pinhole, depth_scale=1.0, depth_trunc=np.inf)
+    return np.asarray(cloud.points)
 
 
 def box_pixels(shape: tuple[int, ...], box_px: tuple[int, int, int, int]) -> np.ndarray:
@@ -100,7 +118,7 @@ def inside_box(points: np.ndarray, lower_m: np.ndarray, upper_m: np.ndarray) -> 
 
 def depth_clip(points: np.ndarray, low_percent: float = 1.0, high_percent: float = 99.0) -> np.ndarray:
     """Keep P_low(z) ≤ z ≤ P_high(z) (paper: 1 % and 99 % of the depths inside the crop)."""
-    z = checked(points)[:, 2]
+    z = check_cloud(points)[:, 2]
     if not len(z):
         return np.zeros(0, bool)
     low, high = np.percentile(z, [low_percent, high_percent])
@@ -110,22 +128,25 @@ def depth_clip(points: np.ndarray, low_percent: float = 1.0, high_percent: float
 def statistical_inliers(points: np.ndarray, k: int = 20, n_sigma: float = 2.0) -> np.ndarray:
     """Keep d̄_i ≤ μ + n_sigma · σ (paper: 2σ), d̄_i the mean distance to the k nearest other points.
 
-    μ and σ are the mean and the standard deviation of all d̄_i. With k or fewer points nothing is dropped.
+    μ and σ are the mean and the standard deviation of all d̄_i. With k or fewer points all are kept.
     """
-    points = checked(points)
+    points = check_cloud(points)
     if len(points) <= k:
         return np.ones(len(points), bool)
-    distance, _ = KDTree(points).query(points, k=k + 1)
-    mean = distance[:, 1:].mean(axis=1)  # column 0 is the point itself
-    return mean <= mean.mean() + n_sigma * mean.std()
+    o3d = load_open3d()
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
+    _, kept = cloud.remove_statistical_outlier(k + 1, n_sigma)  # Open3D counts the point itself among the k + 1
+    keep = np.zeros(len(points), bool)
+    keep[np.asarray(kept, dtype=np.intp)] = True
+    return keep
 
 
 def radius_inliers(points: np.ndarray, radius_m: float = 0.01, min_neighbours: int = 10) -> np.ndarray:
     """Keep |{j ≠ i : ‖p_j − p_i‖ ≤ r}| ≥ min_neighbours."""
-    points = checked(points)
+    points = check_cloud(points)
     if len(points) <= min_neighbours:
         return np.zeros(len(points), bool)
-    # At least m neighbours lie within r exactly if the m-th nearest does; one neighbour is cheaper than counting.
+    # At least m neighbours are within r exactly if the m-th nearest is; one neighbour is cheaper than counting.
     bound = np.nextafter(radius_m, np.inf)
     distance, _ = KDTree(points).query(points, k=min_neighbours + 1, distance_upper_bound=bound)
     return distance[:, -1] <= radius_m
@@ -140,7 +161,7 @@ def subsample(points: np.ndarray, n_max: int, seed: int = 0) -> np.ndarray:
 
 def voxel_downsample(points: np.ndarray, size_m: float) -> np.ndarray:
     """Return the centroid of each occupied voxel floor(p / size_m), (M, 3), ordered by voxel."""
-    points = checked(points)
+    points = check_cloud(points)
     if not len(points):
         return points.astype(float)
     cells = np.floor(points / size_m).astype(np.int64)

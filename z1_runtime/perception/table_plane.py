@@ -1,4 +1,4 @@
-"""The table under the object: found in the scene's cloud, with the noise that says how far up it reaches."""
+"""The table plane in the scene's cloud, with the depth noise that bounds the height of its points."""
 
 from __future__ import annotations
 
@@ -7,17 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from hal.base.errors import InvalidValueError
-from z1_runtime.perception.point_cloud import PerceptionError, checked
+from z1_runtime.perception.errors import NoTableError
+from z1_runtime.perception.point_cloud import check_cloud
 from z1_runtime.types import Plane
-
-
-class NoTableError(PerceptionError):
-    """No table plane where one was expected."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TableFit:
-    """A table plane and how well the depth image knows it."""
+    """A table plane and its depth noise."""
 
     plane: Plane
     noise_per_m: float
@@ -35,20 +32,20 @@ def expected_table(T_base_camera: np.ndarray) -> Plane:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TableConfig:
-    """How the table is looked for."""
+    """Limits of the search for the table."""
 
     inlier_m: float = 0.008
-    """Distance to a hypothesis that counts as on it [m]; about 3σ of the D405 at 0.5 m."""
+    """Maximum distance of an inlier from a hypothesis [m]; about 3σ of the D405 at 0.5 m."""
     max_tilt_rad: float = 0.14
-    """Largest angle to the expected plane [rad]; keeps a big box's face from being called the table."""
+    """Maximum angle to the expected plane [rad]; excludes the face of a large box."""
     max_height_m: float = 0.05
-    """Points further than this from the expected plane are not considered [m]; keeps out tops of boxes."""
+    """Maximum distance of a considered point from the expected plane [m]; excludes tops of boxes."""
     n_hypotheses: int = 128
     """RANSAC draws; with 30 % inliers one is clean with 97 % probability."""
     n_points: int = 20_000
-    """Most points the plane is fitted to, evenly chosen; 2 mm of noise on each leave about 0.02 mm."""
+    """Maximum number of points in the fit, evenly chosen; 2 mm of noise on each leave about 0.02 mm."""
     min_inliers: int = 500
-    """Fewer of them on the plane are no table."""
+    """Minimum number of inliers of a table."""
 
 
 def fit_table(
@@ -70,43 +67,46 @@ def fit_table(
         ValueError: points that are not finite or not in front of the camera.
     """
     config = config or TableConfig()
-    points = checked(points)
+    points = check_cloud(points)
     if (points[:, 2] <= 0).any():
-        raise InvalidValueError("points of a camera lie in front of it (z > 0); is this cloud in another frame?")
+        raise InvalidValueError(
+            "the cloud has points behind the camera (z <= 0); give it in the camera frame.", code="behind_camera"
+        )
     if hint is not None:
-        points = _thinned(points, 3 * config.n_points)
+        points = _thin(points, 3 * config.n_points)
         points = points[np.abs(hint.height_m(points)) < config.max_height_m]
-    points = _thinned(points, config.n_points)
+    points = _thin(points, config.n_points)
     if len(points) < config.min_inliers:
-        raise NoTableError(_no_table(len(points), config, "were seen near where the table should be"))
+        raise NoTableError(_no_table(len(points), config, "are near the expected table"))
     plane = _ransac(points, hint, config, seed)
     if plane is None:
         raise NoTableError(
             f"no plane within {config.max_tilt_rad} rad of the expected table; check that the camera sees the table "
-            "and that the hand-eye transform fits the mount."
+            "and that the extrinsics are right.",
+            code="table_tilt",
         )
     band = np.full(len(points), config.inlier_m)
     noise = 0.0
     for _ in range(3):  # the band follows the noise, and the fit follows the band: settled after two rounds
         inliers = np.abs(plane.height_m(points)) < band
         if inliers.sum() < config.min_inliers:
-            raise NoTableError(_no_table(int(inliers.sum()), config, "lie on the best plane"))
+            raise NoTableError(_no_table(int(inliers.sum()), config, "are on the best plane"))
         plane = _least_squares(points[inliers])
         z2 = points[:, 2] ** 2
-        # 1.4826 · median |r| is σ for Gaussian noise, and deaf to the feet of objects inside the band.
+        # 1.4826 · median |r| is σ for Gaussian noise, and robust to the feet of objects inside the band.
         noise = 1.4826 * float(np.median(np.abs(plane.height_m(points[inliers])) / z2[inliers]))
         band = np.clip(3 * noise * z2, 0.25 * config.inlier_m, 3 * config.inlier_m)
     return TableFit(plane=plane, noise_per_m=noise)
 
 
-def _thinned(points: np.ndarray, n_max: int) -> np.ndarray:
+def _thin(points: np.ndarray, n_max: int) -> np.ndarray:
     return points[:: -(-len(points) // n_max) or 1]
 
 
 def _no_table(n: int, config: TableConfig, where: str) -> str:
     return (
         f"only {n} points {where}, {config.min_inliers} are needed; check that the camera sees the table and that the "
-        "hand-eye transform fits the mount."
+        "extrinsics are right."
     )
 
 
@@ -126,8 +126,8 @@ def _ransac(points: np.ndarray, hint: Plane | None, config: TableConfig, seed: i
         normals, offsets = normals[near], offsets[near]
     if not len(normals):
         return None
-    judged = _thinned(points, 2000)
-    residual = judged @ normals.T - offsets
+    sample = _thin(points, 2000)
+    residual = sample @ normals.T - offsets
     best = int(np.argmin(np.minimum(residual**2, config.inlier_m**2).sum(axis=0)))
     return Plane(normal=normals[best], offset_m=float(offsets[best]))
 

@@ -18,8 +18,9 @@ from z1_runtime.config import RuntimeConfig, ranking_of
 from z1_runtime.geometry.kinematics import Kinematics
 from z1_runtime.grasping.ranking import Ranking
 from z1_runtime.perception import extrinsics_check
-from z1_runtime.perception.detectors import GroundTruthDetector
-from z1_runtime.perception.segmentation import Perception, PerceptionError
+from z1_runtime.perception.detectors.ground_truth import GroundTruthDetector
+from z1_runtime.perception.errors import PerceptionError
+from z1_runtime.perception.segmentation import Perception
 from z1_runtime.planning.planner import GraspPlanner, NoPlanError
 from z1_runtime.types import GraspPlan, Observation
 
@@ -86,7 +87,6 @@ class GraspSelector:
         self.config = config
         self.ranking = ranking_of(config)
         self.T_flange_camera = T_flange_camera
-        self._mount_doubted = False
 
     def decide(self, frame: RgbdFrame, q: np.ndarray) -> GraspSelection:
         """Turn one frame, taken at joint positions `q` (7,), into a plan.
@@ -123,26 +123,12 @@ class GraspSelector:
             PerceptionError: nothing usable was seen.
         """
         times = times or StageTimes()
-        jaw = float(q[-1])
         with times.stage("detect"):
-            T_base_camera = self.kinematics.flange(q[: z1.N_ARM]) @ self._mount_in(frame, jaw)
-            detection = self.perception.detect(frame, T_base_camera, jaw, self.config.object_class or None)
+            filtered = self.perception.filter_self(frame, float(q[-1]))
+            T_base_camera = self.kinematics.flange(q[: z1.N_ARM]) @ filtered.T_flange_camera
+            detection = self.perception.detect(filtered, T_base_camera, self.config.object_class or None)
         with times.stage("cloud"):
-            return self.perception.segment(frame, T_base_camera, jaw, detection)
-
-    def _mount_in(self, frame: RgbdFrame, jaw: float) -> np.ndarray:
-        """Return T_flange_camera (4, 4) as it is known, or as the jaws in `frame` show it where that is another."""
-        seen = self.config.perception.mount.correct(frame, jaw, self.T_flange_camera)
-        if seen is None:
-            return self.T_flange_camera
-        if not self._mount_doubted:
-            self._mount_doubted = True
-            _LOG.warning(
-                "the jaws in the picture show the camera off its mount: what is 0.4 m ahead is %.1f mm beside its "
-                "place. Each look makes up for it; calibrate the camera with `./z1 calibrate hand-eye`.",
-                1e3 * seen.moved_m,
-            )
-        return seen.T_flange_camera
+            return self.perception.segment(filtered, T_base_camera, detection)
 
     def propose(self, observation: Observation) -> GraspSet:
         """Return the generator's candidates for the object, in the camera frame.
@@ -188,18 +174,19 @@ class GraspSelector:
 
     def warm_up(self) -> None:
         """Decide once on a drawn scene, so that the first real frame does not wait for compilers and caches."""
-        if self.config.perception.mount.enabled:
+        if self.config.perception.extrinsics_check.enabled:
             extrinsics_check.warm_up()  # no jaws are in the drawn scene
         q = np.append(z1.Q_HOME, self.config.jaw_home)
         T_base_camera = self.kinematics.flange(z1.Q_HOME) @ self.T_flange_camera
         frame = draw_can(T_base_camera)
         (can,) = GroundTruthDetector().detect(frame, T_base_camera)
-        with suppress(PerceptionError):  # who looks at colours sees no can in a black picture, but is warm then
-            self.perception.detect(frame, T_base_camera, self.config.jaw_home)
+        filtered = self.perception.filter_self(frame, self.config.jaw_home)
+        with suppress(PerceptionError):  # a colour detector finds no can in a black picture, but is warm then
+            self.perception.detect(filtered, T_base_camera)
         try:
-            observation = self.perception.segment(frame, T_base_camera, self.config.jaw_home, can)
+            observation = self.perception.segment(filtered, T_base_camera, can)
             self._choose(observation, q, StageTimes())
-        except (PerceptionError, NoPlanError) as error:  # what cannot be done there may be possible here
+        except (PerceptionError, NoPlanError) as error:  # impossible there may be possible here
             _LOG.info("the warm-up scene has no plan under this configuration: %s", error)
 
 

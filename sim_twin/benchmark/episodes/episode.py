@@ -19,7 +19,7 @@ from sim_twin.benchmark.episodes.scenarios import Scenario
 from sim_twin.benchmark.episodes.seen import SharedObservation
 from sim_twin.benchmark.episodes.trial import RETRIED, Mode, Outcome, Robot, look
 from z1_runtime.motion.executor import MotionError
-from z1_runtime.perception.point_cloud import PerceptionError
+from z1_runtime.perception.errors import PerceptionError
 from z1_runtime.planning.planner import NoPlanError
 from z1_runtime.tasks.grasp_selection import GraspSelector, StageTimes
 from z1_runtime.types import Rejection

@@ -71,8 +71,9 @@ def test_without_a_result_of_this_camera_the_drawing_is_taken_and_told(tmp_path:
 
 
 def test_a_file_of_another_camera_is_refused_with_both_serials(tmp_path: Path):
-    with pytest.raises(ConfigError, match=r"camera B.*is A"):
+    with pytest.raises(ConfigError) as caught:
         find_extrinsics("A", keep(tmp_path, "B", 0.003), tmp_path)
+    assert "B" in str(caught.value) and "A" in str(caught.value)
 
 
 def test_a_file_is_taken_even_where_there_is_a_newer_one(tmp_path: Path):

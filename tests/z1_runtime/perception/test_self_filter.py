@@ -1,10 +1,12 @@
-"""The robot's own jaws in its picture: left out wherever they are, and nothing else with them."""
+"""The robot's own jaws are masked at every opening, and nothing else with them."""
 
 import numpy as np
 import pytest
 
 from hal.base import z1
-from hal.base.transforms import transform_points
+from hal.base.errors import InvalidValueError
+from hal.base.transforms import inverse, transform_points
+from tests.support.errors import raises
 from tests.support.tabletop_scene import (
     INTRINSICS,
     Box,
@@ -16,23 +18,27 @@ from tests.support.tabletop_scene import (
     frame_of,
     gripper_depth,
 )
-from z1_runtime.perception.detectors import TabletopDetector
+from z1_runtime.perception.config import PerceptionConfig
+from z1_runtime.perception.detectors.tabletop import TabletopDetector
+from z1_runtime.perception.errors import NoDetectionError
 from z1_runtime.perception.point_cloud import back_project
-from z1_runtime.perception.segmentation import NoDetectionError, Perception, PerceptionConfig
+from z1_runtime.perception.segmentation import Perception
 from z1_runtime.perception.self_filter import SelfFilter
 
 JAW = -1.0
 BETWEEN_THE_JAWS = Box(0.32, -0.03, (0.02, 0.02, 0.30))
-"""A stick that stands up into the space between the open jaws at home."""
+"""A stick that reaches into the space between the open jaws at home."""
 
 
 def perceive(objects, jaw=JAW, seed=0):
     exact = before(gripper_depth(jaw), cast(objects)[0])
-    return Perception(PerceptionConfig(), TabletopDetector()).observe(frame_of(d405(exact, seed)), T_base_camera(), jaw)
+    return Perception(PerceptionConfig(), TabletopDetector()).observe(
+        frame_of(d405(exact, seed)), T_base_camera() @ inverse(z1.T_FLANGE_CAMERA), jaw
+    )
 
 
 @pytest.mark.parametrize("jaw", [z1.GRIPPER_OPEN, JAW, -0.4, z1.GRIPPER_CLOSED])
-def test_every_pixel_of_the_gripper_is_blanked_at_any_opening(jaw):
+def test_every_pixel_of_the_gripper_is_masked_at_any_opening(jaw):
     alone = gripper_depth(jaw)
     depth = np.where(np.isfinite(alone), alone, 0.0).astype(np.float32)
     assert (depth > 0).sum() > 2000
@@ -48,7 +54,7 @@ def test_a_hand_eye_error_of_5_mm_is_covered():
     assert (SelfFilter().mask_gripper(frame_of(moved), JAW).depth_m > 0).mean() < 1e-4
 
 
-def test_what_stands_between_the_open_jaws_is_kept():
+def test_an_object_between_the_open_jaws_is_kept():
     depth, which = cast([BETWEEN_THE_JAWS])
     visible = (which == 0) & ~(gripper_depth(JAW) < depth)
     flange = transform_points(z1.T_FLANGE_CAMERA, back_project(depth, INTRINSICS, visible))
@@ -59,7 +65,7 @@ def test_what_stands_between_the_open_jaws_is_kept():
     assert kept[visible].mean() > 0.99
 
 
-def test_what_is_behind_the_jaws_is_kept():
+def test_the_background_of_the_jaws_is_kept():
     depth = cast([])[0].astype(np.float32)
     behind = SelfFilter().mask_gripper(frame_of(depth), JAW).depth_m
     np.testing.assert_array_equal(behind, depth)
@@ -78,10 +84,12 @@ def test_the_robots_own_jaws_are_neither_object_nor_scene():
 def test_the_frame_that_is_shown_keeps_its_depth():
     exact = before(gripper_depth(JAW), cast([Cylinder(0.5, 0.0, 0.0325, 0.2)])[0])
     frame = frame_of(d405(exact, 0))
-    seen = Perception(PerceptionConfig(), TabletopDetector()).observe(frame, T_base_camera(), JAW)
+    seen = Perception(PerceptionConfig(), TabletopDetector()).observe(
+        frame, T_base_camera() @ inverse(z1.T_FLANGE_CAMERA), JAW
+    )
     assert seen.frame is frame
 
 
-def test_a_margin_that_makes_no_sense_is_refused():
-    with pytest.raises(ValueError, match=r"margin_m is 0\.0"):
+def test_a_margin_out_of_range_is_rejected():
+    with raises(InvalidValueError, "margin"):
         SelfFilter(margin_m=0.0)

@@ -16,8 +16,8 @@ from tests.support.tabletop_scene import frame_of
 from z1_runtime.config import RuntimeConfig
 from z1_runtime.factory import make_grasp_selector
 from z1_runtime.perception import extrinsics_check
-from z1_runtime.perception.detectors import GroundTruthDetector
-from z1_runtime.perception.segmentation import NoDepthError, NoDetectionError, PerceptionError
+from z1_runtime.perception.detectors.ground_truth import GroundTruthDetector
+from z1_runtime.perception.errors import NoDepthError, NoDetectionError, PerceptionError
 from z1_runtime.planning.planner import NoPlanError
 from z1_runtime.tasks.grasp_selection import GraspSelector, StageTimes, draw_can
 

@@ -16,7 +16,7 @@ from tests.support.tabletop_scene import frame_of
 from z1_runtime.config import RuntimeConfig
 from z1_runtime.factory import make_grasp_selector
 from z1_runtime.motion.executor import MotionError
-from z1_runtime.perception.segmentation import NoDepthError, NoDetectionError
+from z1_runtime.perception.errors import NoDepthError, NoDetectionError
 from z1_runtime.tasks.grasp_selection import GraspSelector, draw_can
 from z1_runtime.tasks.pick import PickTask
 from z1_runtime.visualization.rerun_logger import RerunLogger

@@ -14,7 +14,7 @@ from sim_twin.model.scene import Neighbour
 from sim_twin.model.world import World
 from z1_runtime.config import RuntimeConfig
 from z1_runtime.geometry.kinematics import Kinematics
-from z1_runtime.perception.detectors import TabletopDetector
+from z1_runtime.perception.detectors.tabletop import TabletopDetector
 
 CLUTTERED = Scenario(object="cylinder", distance="mid", lateral="left", pitch_deg=0.0, clutter=3)
 
