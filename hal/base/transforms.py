@@ -1,4 +1,4 @@
-"""Rigid motions as (4, 4) matrices: inverse, distance between two poses, straight interpolation."""
+"""Rigid transforms as (4, 4) matrices: inverse, distance between two poses, straight interpolation."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ def check_pose(T: np.ndarray, name: str) -> np.ndarray:
     """
     T = np.asarray(T, dtype=np.float64)
     if T.shape != (4, 4):
-        raise InvalidValueError(f"{name} has shape {T.shape}; a pose is (4, 4).")
+        raise InvalidValueError(f"{name} has shape {T.shape}; a pose is (4, 4).", code="pose")
     if not np.isfinite(T).all():
-        raise InvalidValueError(f"{name} holds values that are not finite:\n{T}")
+        raise InvalidValueError(f"{name} holds values that are not finite:\n{T}", code="pose")
     R = T[:3, :3]
     if np.abs(R @ R.T - np.eye(3)).max() > _ORTHONORMAL_ATOL or np.linalg.det(R) < 0.0:
-        raise InvalidValueError(f"{name} has no right-handed orthonormal rotation:\n{R}")
+        raise InvalidValueError(f"{name} has no right-handed orthonormal rotation:\n{R}", code="pose")
     if np.abs(T[3] - (0.0, 0.0, 0.0, 1.0)).max() > _ORTHONORMAL_ATOL:
-        raise InvalidValueError(f"{name} has the last row {T[3]}; it must be (0, 0, 0, 1).")
+        raise InvalidValueError(f"{name} has the last row {T[3]}; it must be (0, 0, 0, 1).", code="pose")
     return T
 
 

@@ -1,13 +1,13 @@
-"""The Z1's beak in the plane in which it closes: its inner faces, and how they lie around a disc.
+"""Fit of the Z1's jaws around a disc, in the plane in which they close.
 
-Both inner faces were measured from the STL meshes. A jaw is flat for the 24 mm behind its tip (z = −9 mm with the beak
-closed), then recedes by about 23° towards the palm. The edge between the two, the *knee*, lies 76.7 mm from the
-mover's axis on both jaws. With the beak opened by φ the flats stand φ apart, so they would squeeze an object out like a
-wedge; the knees face each other squarely whatever φ is. A grasp therefore puts the knees on the contact axis, the
-object midway, and splits φ between the two jaws. Objects wider than 65 mm touch the palm first and sit further out.
+Both inner faces (`hal.base.z1_gripper`) are flat for the 24 mm behind the tip (z = −9 mm with the jaws closed), then
+recede by about 23° towards the palm. The edge between the two parts, the *knee*, is 76.7 mm from the moving jaw's axis
+on both jaws. At an opening φ the flats are φ apart and would squeeze an object out like a wedge; the knees face each
+other squarely at every φ. A grasp therefore puts the knees on the contact axis, the object midway, and splits φ between
+the two jaws. Objects wider than 65 mm touch the palm first and are held further out.
 
-Only one jaw moves, so a hand that stands still would shove the object over to the fixed one, and topple what leans.
-While the jaw closes the hand therefore turns about the jaw's axis the other way, and both jaws arrive together.
+Only one jaw moves, so a gripper at rest would push the object towards the stationary one, and topple a leaning object.
+While the jaw closes the gripper therefore turns about the jaw's axis the other way, and both jaws arrive together.
 """
 
 from __future__ import annotations
@@ -20,39 +20,38 @@ from numba import njit
 
 from hal.base.z1_gripper import KNEE_RADIUS_M, MOVING_FACE, PALM_RADIUS_M, STATIONARY_FACE
 
-_MOST_PAST = 0.15  # of an object's radius: further, and a thin one would sit behind the knees
+_MAX_PAST_RATIO = 0.15  # of an object's radius: beyond it, a thin object would be behind the knees
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BeakConfig:
-    """How the beak is laid around an object."""
+    """Placement of the gripper around an object."""
 
     contact_depth_m: float = 0.012
-    """How far the grasp's origin, midway between a generator's fingertips, lies beyond the contacts: half of what
-    generators reach past them. The beak's own tips then pass the contacts by some 20 mm [m]."""
+    """Distance of the grasp's origin, midway between a generator's fingertips, beyond the contacts: half of the reach
+    of generators past them. The Z1's own tips then pass the contacts by some 20 mm [m]."""
     knee_past_m: float = 0.003
-    """How far the knees go beyond the contact axis along the approach; a little beyond pulls the object in [m]."""
+    """Distance of the knees beyond the contact axis along the approach; a little beyond pulls the object in [m]."""
     max_setback_m: float = 0.025
-    """How far before the asked contacts an object that reaches deep into the hand may be held instead [m]."""
+    """Maximum distance before the requested contacts at which an object that reaches the palm is held instead [m]."""
     unseen_m: float = 0.004
-    """How much farther out than said a contact is thought to be that the camera does not see: generators take what
-    they cannot see for less than it is [m]."""
+    """Margin added to contacts on the occluded side: generators underestimate what the camera cannot see [m]."""
     max_deepening_m: float = 0.010
-    """How far beyond the asked contacts an object is held that reaches less far towards the palm than a round one of
-    its width: it is wider there [m]."""
+    """Maximum distance beyond the requested contacts at which an object is held that reaches less far towards the palm
+    than a round one of its width: it is wider there [m]."""
     palm_clearance_m: float = 0.005
     """Free space between the palm and the object [m]."""
     clearance_m: float = 0.0095
     """Gap between each jaw and the object while approaching; opening wider makes tilted objects collide [m]."""
     squeeze_m: float = 0.016
-    """How much narrower than the object the gap is where the hand stops turning; the jaw closes on from there. So the
-    jaws are at their fastest when they touch, and an error of the middle costs least time between the two [m]."""
+    """Width of the object minus the gap at which the gripper stops turning; from there the jaw closes alone. The jaws
+    are thus at their fastest when they touch, and an error of the centre delays the second contact least [m]."""
     friction: float = 0.4
-    """Least friction coefficient that must keep the object from being squeezed out; rubber on plastic has 0.5 to 1."""
+    """Minimum friction coefficient that must hold the object against the wedge; rubber on plastic has 0.5 to 1."""
 
 
 class Lay(NamedTuple):
-    """How the beak lies around N discs, in the pivot's xz plane."""
+    """The jaws around N discs, in the pivot's xz plane."""
 
     contact: np.ndarray
     """(N,) opening at which both jaws touch [rad]."""
@@ -61,31 +60,31 @@ class Lay(NamedTuple):
     pressed: np.ndarray
     """(N,) opening at which the gap is narrower by the squeeze [rad]."""
     turn: np.ndarray
-    """(N,) how far the hand turns about the mover's axis while the jaw goes from `opened` to `pressed` [rad]."""
+    """(N,) turn of the gripper about the moving jaw's axis while the jaw goes from `opened` to `pressed` [rad]."""
     centre: np.ndarray
-    """(N, 2) the disc's middle while the jaw is opened [m]."""
+    """(N, 2) the disc's centre while the jaw is opened [m]."""
     tilt: np.ndarray
     """(N,) angle of the approach axis from x towards z while the jaw is opened [rad]."""
     squeeze_out: np.ndarray
     """(N,) half the angle between the two contacts' pushes, positive outwards [rad]."""
     setback_m: np.ndarray
-    """(N,) how far before the contact axis the disc lies, so that the palm stays clear of the object [m]."""
+    """(N,) distance of the disc before the contact axis, so that the palm stays clear of the object [m]."""
 
 
 def lay_around(widths: np.ndarray, fronts: np.ndarray, config: BeakConfig) -> Lay:
-    """Return how the beak lies around discs `widths` (N,) wide that reach `fronts` (N,) towards the palm [m]."""
+    """Return the jaws around discs of `widths` (N,) that reach `fronts` (N,) towards the palm [m]."""
     r = 0.5 * widths
-    knees = np.sqrt(np.maximum(KNEE_RADIUS_M**2 - r**2, 0.0)) - np.minimum(config.knee_past_m, _MOST_PAST * r)
+    knees = np.sqrt(np.maximum(KNEE_RADIUS_M**2 - r**2, 0.0)) - np.minimum(config.knee_past_m, _MAX_PAST_RATIO * r)
     palm_m = PALM_RADIUS_M + config.palm_clearance_m
     distance = np.maximum(knees, palm_m + np.minimum(fronts, r))
     above, contact = _gap(distance, r)
     centre = _polar(distance, above)
-    on_stator = _nearest(STATIONARY_FACE, centre)
-    on_mover = _turned(_nearest(MOVING_FACE, _turned(centre, -contact)), contact)
-    across = on_mover - on_stator
+    on_stationary = _nearest(STATIONARY_FACE, centre)
+    on_moving = _rotate(_nearest(MOVING_FACE, _rotate(centre, -contact)), contact)
+    across = on_moving - on_stationary
     across /= np.linalg.norm(across, axis=1, keepdims=True)
     along = np.column_stack([across[:, 1], -across[:, 0]])
-    push = np.sum((2.0 * centre - on_stator - on_mover) * along, axis=1)
+    push = np.sum((2.0 * centre - on_stationary - on_moving) * along, axis=1)
     above_open, opened = _gap(distance, r + config.clearance_m)
     above_pressed, pressed = _gap(distance, np.maximum(r - 0.5 * config.squeeze_m, 0.0))
     return Lay(
@@ -96,20 +95,20 @@ def lay_around(widths: np.ndarray, fronts: np.ndarray, config: BeakConfig) -> La
         centre=_polar(distance, above_open),
         tilt=np.arctan2(along[:, 1], along[:, 0]) + above_open - above,
         squeeze_out=np.arctan2(push, widths),
-        # What reaches further towards the palm than it is thick is held where there is room, nearer its front
+        # An object that reaches further towards the palm than it is thick is held nearer its front
         setback_m=np.maximum(knees, palm_m + fronts) - distance,
     )
 
 
 def _gap(distance: np.ndarray, r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return where discs at `distance` (N,) that touch both jaws lie above the pivot's x (N,), and the opening (N,)."""
+    """Return the bearings (N,) above the pivot's x of discs at `distance` (N,) on both jaws, and the opening (N,)."""
     above, below = _bearing(STATIONARY_FACE, distance, r, 1.0), _bearing(MOVING_FACE, distance, r, -1.0)
     return above, above - below
 
 
 @njit(cache=True)
 def _bearing(face, distance, r, side):
-    """Return the angles (N,) [rad] of discs' middles, at `distance` (N,) from the axis, that just touch `face`.
+    """Return the angles (N,) [rad] of discs' centres, at `distance` (N,) from the axis, that just touch `face`.
 
     `side` is +1 when the disc lies above the face, −1 below. The gap grows with the angle: bisection finds it.
     """
@@ -132,20 +131,20 @@ def _bearing(face, distance, r, side):
 @njit(cache=True)
 def _squared_gap(face, x, z):
     """Return the squared distance of (x, z) from polyline `face` (K, 2)."""
-    least = np.inf
+    minimum = np.inf
     for k in range(len(face) - 1):
         dx, dz = face[k + 1, 0] - face[k, 0], face[k + 1, 1] - face[k, 1]
         t = ((x - face[k, 0]) * dx + (z - face[k, 1]) * dz) / (dx * dx + dz * dz)
         t = min(max(t, 0.0), 1.0)
-        least = min(least, (face[k, 0] + t * dx - x) ** 2 + (face[k, 1] + t * dz - z) ** 2)
-    return least
+        minimum = min(minimum, (face[k, 0] + t * dx - x) ** 2 + (face[k, 1] + t * dz - z) ** 2)
+    return minimum
 
 
 def _polar(distance: np.ndarray, angle: np.ndarray) -> np.ndarray:
     return np.column_stack([distance * np.cos(angle), distance * np.sin(angle)])
 
 
-def _turned(points: np.ndarray, angle: np.ndarray) -> np.ndarray:
+def _rotate(points: np.ndarray, angle: np.ndarray) -> np.ndarray:
     c, s = np.cos(angle), np.sin(angle)
     x, z = points.T
     return np.column_stack([c * x - s * z, s * x + c * z])

@@ -1,4 +1,4 @@
-"""The wrist's shape for collision tests: surface points of gripper, camera and bracket (links: `hal.base.z1_shape`)."""
+"""Surface points of gripper, camera and bracket for collision tests (links: `hal.base.z1_shape`)."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from hal.base.transforms import transform_points
 from hal.base.z1_gripper import PALM_RADIUS_M, T_PIVOT_STATIONARY_JAW
 
 _SPACING_M = 0.0085
-_JAW_SPACING_M = 0.005  # jaws pass the object within millimetres, and its edges must not slip between two points
+_JAW_SPACING_M = 0.005  # jaws pass the object within millimetres, and its edges must not fit between two points
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GripperShape:
-    """Evenly spread surface points of what the wrist carries, in an order whose every head is spread out."""
+    """Even surface points of everything on the wrist, in an order of which every head is spread over the whole."""
 
     fixed: np.ndarray
-    """(V, 3) wrist, fixed jaw, camera and bracket, in the pivot frame [m]."""
+    """(V, 3) wrist, stationary jaw, camera and bracket, in the pivot frame [m]."""
     mover: np.ndarray
-    """(V, 3) moving jaw, in its own frame: the pivot frame at mover angle 0 [m]."""
+    """(V, 3) moving jaw, in its own frame: the pivot frame at jaw angle 0 [m]."""
 
     def __len__(self) -> int:
         return len(self.fixed) + len(self.mover)
@@ -35,7 +35,7 @@ def gripper_shape(spacing_m: float = _SPACING_M) -> GripperShape:
     stator = transform_points(T_PIVOT_STATIONARY_JAW, _mesh_surface("z1_GripperStator", spacing_m))
     jaw = transform_points(T_PIVOT_STATIONARY_JAW, _mesh_surface("z1_GripperStator", _JAW_SPACING_M))
     stator = np.concatenate([stator[stator[:, 0] < PALM_RADIUS_M], jaw[jaw[:, 0] >= PALM_RADIUS_M]])
-    # The housing is hollow; nothing gets inside without crossing what surrounds it
+    # The housing is hollow; nothing gets inside without crossing its surface
     inside = (np.hypot(stator[:, 0], stator[:, 2]) < PALM_RADIUS_M - 0.002) & (np.abs(stator[:, 1]) < 0.026)
     wrist = transform_points(T_pivot_flange, _mesh_surface("z1_Link06", spacing_m))
     camera = transform_points(

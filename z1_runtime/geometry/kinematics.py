@@ -1,4 +1,4 @@
-"""Where the links are for given joints (pinocchio), and which joints reach a pose (ssik, else least squares)."""
+"""Inverse kinematics: the joints that reach a pose (ssik, else least squares), and paths on one branch."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ POSITION_TOLERANCE_M = 0.002
 ROTATION_TOLERANCE_RAD = float(np.deg2rad(1.0))
 """The paper's tolerance of its least-squares solution [rad]."""
 MAX_JUMP_RAD = 0.15
-"""More than this between two waypoints 5 mm apart is a change of branch, or a singularity [rad]."""
+"""Maximum joint motion between two waypoints 5 mm apart; more is a change of branch, or a singularity [rad]."""
 
 _ARM_MIN, _ARM_MAX = z1.Q_MIN[: z1.N_ARM], z1.Q_MAX[: z1.N_ARM]
 _LIMIT_ATOL = 1e-9  # rounding of the solver at a pose whose joints are exactly at a limit
@@ -37,7 +37,7 @@ class IkFailure(Z1Error):
     """No joint vector reaches a pose, or a path of poses without a jump.
 
     Attributes:
-        position_error_m: how far the best try stays away [m]; NaN if none was measured.
+        position_error_m: position error of the best try [m]; NaN if none was measured.
         rotation_error_rad: its angle error [rad]; NaN if none was measured.
         waypoint: index of the pose along a path, or None.
         joint: name of the joint that would jump, or None.
@@ -49,12 +49,13 @@ class IkFailure(Z1Error):
         self,
         message: str,
         *,
+        code: str | None = None,
         position_error_m: float = float("nan"),
         rotation_error_rad: float = float("nan"),
         waypoint: int | None = None,
         joint: str | None = None,
     ) -> None:
-        super().__init__(message)
+        super().__init__(message, code=code)
         self.position_error_m = position_error_m
         self.rotation_error_rad = rotation_error_rad
         self.waypoint = waypoint
@@ -68,12 +69,13 @@ class IkResult:
     q: np.ndarray
     """(6,) arm joints, inside the limits [rad]."""
     n_branches: int
-    """How many analytic branches lie inside the limits; 0 when least squares found it."""
+    """Number of analytic branches inside the limits; 0 with least squares."""
     method: IkMethod
+    """How the joints were found."""
     position_error_m: float
-    """Distance between the pose asked and the pose reached [m]."""
+    """Distance between the requested and the reached pose [m]."""
     rotation_error_rad: float
-    """Angle between the pose asked and the pose reached [rad]."""
+    """Angle between the requested and the reached pose [rad]."""
 
 
 class Kinematics(ForwardKinematics):
@@ -106,14 +108,14 @@ class Kinematics(ForwardKinematics):
     def best(self, T_base_pivot: np.ndarray, q_near: np.ndarray = z1.Q_HOME) -> IkResult:
         """Return the solution that minimises ‖q − q_near‖² inside the limits (the paper's choice among branches).
 
-        Where there is no branch, the nearest pose is searched by the paper's regularised least squares, in 1 to 3 ms.
+        Without a branch, the nearest pose is searched by the paper's regularised least squares, in 1 to 3 ms.
 
         Args:
             T_base_pivot: (4, 4) pose to reach.
             q_near: (6,) posture to stay close to, the paper's q_home [rad].
 
         Raises:
-            IkFailure: nothing within 2 mm and 1°.
+            IkFailure: no joints within 2 mm and 1°.
             ValueError: `T_base_pivot` is not a pose.
         """
         branches = self.solve(T_base_pivot)
@@ -135,7 +137,7 @@ class Kinematics(ForwardKinematics):
         """Return arm joints (N, 6) along a Cartesian path (N, 4, 4), staying on one branch from `q_start` (6,).
 
         Args:
-            Ts_base_pivot: (N, 4, 4) poses, about 5 mm apart; the first is where `q_start` is, or one step on.
+            Ts_base_pivot: (N, 4, 4) poses, about 5 mm apart; the first is that of `q_start`, or one step further.
             q_start: (6,) arm joints before the first waypoint [rad].
             max_jump_rad: largest move of a joint between two waypoints [rad].
 
@@ -148,7 +150,7 @@ class Kinematics(ForwardKinematics):
             branches = self.solve(T_base_pivot)
             where = f"waypoint {i} of {len(qs)} ({_describe(T_base_pivot)})"
             if not branches:
-                raise IkFailure(f"no joints inside the limits reach {where}.", waypoint=i)
+                raise IkFailure(f"no joints inside the limits reach {where}.", code="waypoint_unreachable", waypoint=i)
             nearest = min(branches, key=lambda branch, q=q: float(np.abs(branch - q).max()))
             jumps = np.abs(nearest - q)
             worst = int(jumps.argmax())
@@ -156,6 +158,7 @@ class Kinematics(ForwardKinematics):
                 joint = z1.JOINT_NAMES[worst]
                 raise IkFailure(
                     f"{joint} would jump by {jumps[worst]:.3f} rad at {where}; allowed is {max_jump_rad:.3f} rad.",
+                    code="branch_jump",
                     waypoint=i,
                     joint=joint,
                 )
@@ -174,9 +177,10 @@ class Kinematics(ForwardKinematics):
         misfit, q, position_error_m, rotation_error_rad = min(tries, key=lambda one: one[0])
         if misfit > 1.0:
             raise IkFailure(
-                f"no joints inside the limits reach {_describe(T_base_pivot)}: the nearest found stays "
-                f"{position_error_m * 1e3:.1f} mm and {np.rad2deg(rotation_error_rad):.1f}° away; allowed is "
+                f"no joints inside the limits reach {_describe(T_base_pivot)}: the nearest found is "
+                f"{position_error_m * 1e3:.1f} mm and {np.rad2deg(rotation_error_rad):.1f}° off; allowed is "
                 f"{POSITION_TOLERANCE_M * 1e3:.0f} mm and {np.rad2deg(ROTATION_TOLERANCE_RAD):.0f}°.",
+                code="unreachable",
                 position_error_m=position_error_m,
                 rotation_error_rad=rotation_error_rad,
             )
@@ -198,7 +202,7 @@ class Kinematics(ForwardKinematics):
             J = self.jacobian(q) / _TOLERANCES[:, None]
             H = J.T @ J + _REGULARISATION * np.eye(z1.N_ARM)
             downhill = J.T @ residual - _REGULARISATION * (q - q_near)
-            # A joint at its limit that would go further takes no part in this step
+            # A joint at its limit that would go beyond it is left out of this step
             free = ~(((q <= _ARM_MIN) & (downhill < 0.0)) | ((q >= _ARM_MAX) & (downhill > 0.0)))
             if not free.any():
                 break
