@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal, TypeVar, get_args
+from typing import Any, Literal, get_args
 
 import yaml
 
-from hal.base.errors import ConfigError, InvalidValueError
+from hal.base.errors import InvalidValueError
+from hal.base.structure import read_yaml, structure
 from models.detector.runtimes import RUNTIMES
 from models.factory import Process, generator_for, split_generator_name
 from z1_runtime.grasping.ranking import Ranking, load_scoring
@@ -18,8 +18,6 @@ from z1_runtime.motion.executor import ExecutorConfig
 from z1_runtime.perception.config import PerceptionConfig
 from z1_runtime.perception.detectors.factory import DETECTORS
 from z1_runtime.planning.planner_config import PlannerConfig
-
-T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -113,26 +111,20 @@ def load_config(path: Path | None = None) -> RuntimeConfig:
     """Return the defaults with the values of the YAML file at `path` put over them.
 
     Raises:
-        ConfigError: the file is missing, is not YAML, or has a key or a value that does not belong there.
+        ConfigError: the file is missing, is not YAML, or has an unknown key or an invalid value.
     """
     if path is None:
         return RuntimeConfig()
-    try:
-        data = yaml.safe_load(path.read_text())
-    except OSError as err:
-        raise ConfigError(f"the configuration {path} cannot be read: {err.strerror}.") from err
-    except yaml.YAMLError as err:
-        raise ConfigError(f"the configuration {path} is not YAML: {err}") from err
-    return config_from(data or {}, str(path))
+    return config_from(read_yaml(path, "the configuration") or {}, str(path))
 
 
 def config_from(data: Mapping[str, Any], where: str) -> RuntimeConfig:
     """Return the defaults with the values of `data` put over them, as `asdict`, YAML and JSON give them.
 
     Raises:
-        ConfigError: a key or a value does not belong there; the message begins with `where`.
+        ConfigError: an unknown key or an invalid value; the message begins with `where`.
     """
-    return _overlay(RuntimeConfig(), data, where)
+    return structure(RuntimeConfig, data, where)
 
 
 def with_detector(
@@ -183,36 +175,6 @@ def hand_set(config: RuntimeConfig) -> Ranking:
 def save_config(config: RuntimeConfig, path: Path) -> None:
     """Write `config` as YAML that `load_config` reads back to an equal one."""
     path.write_text(yaml.safe_dump(asdict(config), sort_keys=False))
-
-
-def _overlay(default: T, data: Any, where: str) -> T:
-    if not isinstance(data, Mapping):
-        raise ConfigError(f"{where} holds {data!r}; it must hold keys and values.")
-    known = {f.name: getattr(default, f.name) for f in fields(default)}  # type: ignore[arg-type]
-    values = {}
-    for key, value in data.items():
-        if key not in known:
-            near = difflib.get_close_matches(str(key), known, n=1)
-            hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(known)}."
-            raise ConfigError(f"{where} has an unknown key {key!r}; {hint}")
-        values[key] = _converted(known[key], value, f"{where}: {key}")
-    try:
-        return replace(default, **values)  # type: ignore[type-var]
-    except ValueError as err:
-        raise ConfigError(f"{where}: {err}") from err
-
-
-def _converted(old: Any, value: Any, where: str) -> Any:
-    """Return `value` in the type that `old` has."""
-    if is_dataclass(old):
-        return _overlay(old, value, where)
-    if isinstance(old, tuple) and isinstance(value, list) and len(value) == len(old):
-        return tuple(_converted(o, v, where) for o, v in zip(old, value, strict=True))
-    if isinstance(old, float) and isinstance(value, int) and not isinstance(value, bool):
-        return float(value)
-    if type(value) is not type(old):
-        raise ConfigError(f"{where} is {value!r}; it must be a {type(old).__name__}, such as {old!r}.")
-    return value
 
 
 def _require(ok: bool, name: str, seen: object, allowed: str) -> None:

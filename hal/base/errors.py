@@ -52,9 +52,17 @@ class InvalidValueError(UsageError):
 
 
 class ConfigError(UsageError):
-    """A configuration file that cannot be used; the message names the key."""
+    """A configuration file that cannot be used; the message names the key.
+
+    Attributes:
+        key: path of the key in the file, such as `planner.lift_m`; empty without one.
+    """
 
     default_code = "invalid_config"
+
+    def __init__(self, message: str = "", *, code: str | None = None, key: str = "") -> None:
+        super().__init__(message, code=code)
+        self.key = key
 
 
 class OutputExistsError(UsageError, FileExistsError):

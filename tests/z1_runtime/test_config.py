@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from hal.base.errors import ConfigError
+from tests.support.errors import raises
 from z1_runtime.config import RuntimeConfig, load_config, save_config, with_generator
 
 
@@ -34,37 +35,52 @@ def test_a_file_changes_only_what_it_names(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "code", "key"),
     [
-        ("sped: 0.5", "did you mean 'speed'"),
-        ("speed: fast", "speed is 'fast'"),
-        ("speed: 7", "above 0, up to 1"),
-        ("planner:\n  lift: 0.2", "'lift'"),
-        ("planner: 3", "keys and values"),
-        ("n_candidates: true", "n_candidates is True"),
-        ("perception:\n  clip_percent: [1]", "clip_percent"),
-        ("box_method: sphere", "box_method"),
-        ("hold_s: -1", "hold_s is -1.0; allowed is 0 to 60 s"),
-        ("frame_timeout_s: .nan", "frame_timeout_s is nan"),
-        ("held_torque_nm: -2", "held_torque_nm is -2.0"),
-        ("executor:\n  stall_timeout_s: 0", "stall_timeout_s is 0.0"),
-        ("planner:\n  collision:\n    transfer_threshold_m: 0.05", "transfer_threshold_m is 0.05"),
-        ("perception:\n  own:\n    margin_m: 1", "margin_m is 1.0"),
-        ("- 1", "keys and values"),
-        ("a: [", "not YAML"),
+        ("sped: 0.5", "unknown_key", "sped"),
+        ("speed: fast", "wrong_type", "speed"),
+        ("speed: 7", "out_of_range", ""),
+        ("planner:\n  lift: 0.2", "unknown_key", "planner.lift"),
+        ("planner: 3", "wrong_type", "planner"),
+        ("n_candidates: true", "wrong_type", "n_candidates"),
+        ("k_faces: 2.0", "wrong_type", "k_faces"),
+        ("perception:\n  clip_percent: [1]", "wrong_type", "perception.clip_percent.1"),
+        ("box_method: sphere", "wrong_type", "box_method"),
+        ("hold_s: -1", "out_of_range", ""),
+        ("frame_timeout_s: .nan", "out_of_range", ""),
+        ("held_torque_nm: -2", "out_of_range", ""),
+        ("executor:\n  stall_timeout_s: 0", "out_of_range", "executor"),
+        ("planner:\n  collision:\n    transfer_threshold_m: 0.05", "out_of_range", "planner.collision"),
+        ("perception:\n  self_filter:\n    margin_m: 1", "out_of_range", "perception.self_filter"),
+        ("- 1", "wrong_type", ""),
+        ("a: [", "not_yaml", ""),
     ],
 )
-def test_a_wrong_file_is_refused_with_the_key(tmp_path: Path, text: str, said: str) -> None:
+def test_an_invalid_file_is_rejected_with_its_name_and_key(tmp_path: Path, text: str, code: str, key: str) -> None:
     path = tmp_path / "c.yaml"
     path.write_text(text)
-    with pytest.raises(ConfigError, match=r"c\.yaml") as caught:
+    with raises(ConfigError, code) as caught:
         load_config(path)
-    assert said in str(caught.value)
+    assert caught.value.key == key
+    assert str(path) in str(caught.value)
 
 
-def test_a_missing_file_is_named(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"nowhere\.yaml"):
-        load_config(tmp_path / "nowhere.yaml")
+def test_a_typing_error_gets_a_suggestion_and_a_wrong_value_its_range(tmp_path: Path) -> None:
+    for text, hint in (("sped: 0.5", "did you mean 'speed'?"), ("hold_s: -1", "hold_s is -1.0; allowed is 0 to 60 s")):
+        (tmp_path / "c.yaml").write_text(text)
+        with pytest.raises(ConfigError) as caught:
+            load_config(tmp_path / "c.yaml")
+        assert hint in str(caught.value)
+
+
+@pytest.mark.parametrize("content", [b"detector_weights: gew\xfcrz.pt", None])
+def test_an_unreadable_file_is_rejected(tmp_path: Path, content: bytes | None) -> None:
+    path = tmp_path / "c.yaml"
+    if content is not None:
+        path.write_bytes(content)
+    with raises(ConfigError, "unreadable") as caught:
+        load_config(path)
+    assert str(path) in str(caught.value)
 
 
 def test_a_command_line_s_weights_choose_their_generator_unless_one_that_takes_them_is_configured(tmp_path):

@@ -13,7 +13,7 @@ from hal.base.messages import RgbdFrame
 from models.detector.detector import best_of, labels_for
 from models.types import Detection
 from z1_runtime.perception.config import PerceptionConfig
-from z1_runtime.perception.detectors.base import Detector
+from z1_runtime.perception.detector import Detector
 from z1_runtime.perception.errors import NoDepthError, NoDetectionError, SmallCloudError
 from z1_runtime.perception.occlusion import occluded_points
 from z1_runtime.perception.point_cloud import (

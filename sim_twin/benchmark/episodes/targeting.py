@@ -13,7 +13,7 @@ from models.types import Detection
 from sim_twin.benchmark.episodes.scenarios import Scenario
 from sim_twin.model.objects import PAPER_OBJECTS
 from z1_runtime.config import RuntimeConfig
-from z1_runtime.perception.detectors.base import Detector
+from z1_runtime.perception.detector import Detector
 from z1_runtime.perception.detectors.tabletop import TabletopDetector
 
 

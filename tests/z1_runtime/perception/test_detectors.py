@@ -20,8 +20,8 @@ from tests.support.tabletop_scene import (
     noisy_frame,
     truth,
 )
+from z1_runtime.perception.detector import mask_box
 from z1_runtime.perception.detectors import yolo as yolo_detector
-from z1_runtime.perception.detectors.base import mask_box
 from z1_runtime.perception.detectors.factory import make_detector
 from z1_runtime.perception.detectors.ground_truth import GroundTruthDetector
 from z1_runtime.perception.detectors.tabletop import TabletopDetector

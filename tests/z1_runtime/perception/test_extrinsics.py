@@ -43,7 +43,7 @@ def shift_m(T_flange_camera: np.ndarray) -> float:
     return float(T_flange_camera[0, 3] - z1.T_FLANGE_CAMERA[0, 3])
 
 
-def test_the_newest_of_this_camera_is_taken_and_told(tmp_path: Path):
+def test_the_newest_of_this_camera_is_used_with_a_message(tmp_path: Path):
     keep(tmp_path, "A", 0.001)
     newest = keep(tmp_path, "A", 0.002)
     keep(tmp_path, "B", 0.003)
@@ -61,16 +61,16 @@ def test_a_damaged_newest_result_gives_way_to_the_one_before(tmp_path: Path, cap
     assert newest.name in caplog.text
 
 
-def test_without_a_result_of_this_camera_the_drawing_is_taken_and_told(tmp_path: Path):
+def test_without_a_result_of_this_camera_the_drawing_is_used_with_a_message(tmp_path: Path):
     keep(tmp_path, "B", 0.003)
-    for serial, said in (("A", "camera A"), ("", "no serial number")):
+    for serial, text in (("A", "camera A"), ("", "no serial number")):
         mount = find_extrinsics(serial, folder=tmp_path)
         assert np.array_equal(mount.T_flange_camera, z1.T_FLANGE_CAMERA)
-        assert "drawing" in mount.origin and said in mount.origin and str(tmp_path) in mount.origin
+        assert "drawing" in mount.origin and text in mount.origin and str(tmp_path) in mount.origin
     assert "drawing" in find_extrinsics("A", folder=tmp_path / "missing").origin
 
 
-def test_a_file_of_another_camera_is_refused_with_both_serials(tmp_path: Path):
+def test_a_file_of_another_camera_is_rejected_with_both_serials(tmp_path: Path):
     with pytest.raises(ConfigError) as caught:
         find_extrinsics("A", keep(tmp_path, "B", 0.003), tmp_path)
     assert "B" in str(caught.value) and "A" in str(caught.value)
@@ -82,20 +82,16 @@ def test_a_file_is_taken_even_where_there_is_a_newer_one(tmp_path: Path):
     assert shift_m(find_extrinsics("A", older, tmp_path).T_flange_camera) == pytest.approx(0.001)
 
 
-def test_files_that_are_no_hand_eye_result_of_a_wrist_camera_are_refused(tmp_path: Path):
+def test_files_that_are_no_hand_eye_result_of_a_wrist_camera_are_rejected(tmp_path: Path):
     damaged = tmp_path / "damaged.json"
     damaged.write_text("{}")
-    beside = keep(tmp_path, "A", 0.0, setup="eye_to_hand")
+    other_setup = keep(tmp_path, "A", 0.0, setup="eye_to_hand")
     none = {"setup": None, "T_mount_camera": None, "T_anchor_board": None, "covariance": None}
     lens = keep(tmp_path, "A", 0.0, kind="intrinsics", errors={"rms_px": 0.1}, **none)
-    for file, said in (
-        (damaged, "no calibration result"),
-        (tmp_path / "missing.json", "there is no calibration"),
-        (beside, "eye_to_hand"),
-        (lens, "intrinsics"),
-    ):
-        with pytest.raises(ConfigError, match=said):
+    for file in (damaged, tmp_path / "missing.json", other_setup, lens):
+        with pytest.raises(ConfigError) as caught:
             find_extrinsics("A", file, tmp_path)
+        assert str(file) in str(caught.value)
 
 
 def test_an_uncertain_result_is_used_with_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture):
@@ -107,7 +103,7 @@ def test_an_uncertain_result_is_used_with_a_warning(tmp_path: Path, caplog: pyte
     assert "uncertainty_mm" in caplog.text and "calibrate again" in caplog.text
 
 
-def test_results_are_kept_in_the_user_s_data_unless_told_otherwise(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_results_are_kept_in_the_user_s_data_by_default(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("Z1_CALIBRATIONS", str(tmp_path / "named"))
     assert results_folder(tmp_path / "given") == tmp_path / "given"
     assert results_folder() == tmp_path / "named"

@@ -11,7 +11,7 @@ from models.types import Detection
 from tests.support.errors import raises
 from tests.support.tabletop_scene import INTRINSICS, Box, Cylinder, T_base_camera, cast, frame_of, noisy_frame, truth
 from z1_runtime.perception.config import PerceptionConfig
-from z1_runtime.perception.detectors.base import mask_box
+from z1_runtime.perception.detector import mask_box
 from z1_runtime.perception.detectors.ground_truth import GroundTruthDetector
 from z1_runtime.perception.detectors.tabletop import TabletopDetector
 from z1_runtime.perception.errors import NoDepthError, NoDetectionError, PerceptionError, SmallCloudError

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from hal.base.errors import InvalidValueError
 from models.detector.detector import YoloConfig
 from models.weights_file import WeightsError
-from z1_runtime.perception.detectors.base import Detector
+from z1_runtime.perception.detector import Detector
 from z1_runtime.perception.detectors.ground_truth import GroundTruthDetector
 from z1_runtime.perception.detectors.tabletop import TabletopDetector
 from z1_runtime.perception.detectors.yolo import YoloDetector

@@ -6,7 +6,7 @@ import numpy as np
 
 from hal.base.messages import RgbdFrame
 from models.types import Detection
-from z1_runtime.perception.detectors.base import mask_box
+from z1_runtime.perception.detector import mask_box
 from z1_runtime.perception.errors import PerceptionError
 
 

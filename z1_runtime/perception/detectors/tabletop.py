@@ -10,7 +10,7 @@ import numpy as np
 from hal.base.messages import RgbdFrame
 from hal.base.transforms import transform_points
 from models.types import Detection
-from z1_runtime.perception.detectors.base import mask_box
+from z1_runtime.perception.detector import mask_box
 from z1_runtime.perception.point_cloud import back_project, continuous_pixels, inside_box, valid_pixels
 from z1_runtime.perception.table_plane import TableConfig, expected_table, fit_table
 
