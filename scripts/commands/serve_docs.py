@@ -26,7 +26,9 @@ class ServeDocsConfig:
 
     def __post_init__(self) -> None:
         if not 1 <= self.port <= 65535:
-            raise InvalidValueError(f"docs: the port is out of range ({self.port}, allowed 1 to 65535). Choose another.")
+            raise InvalidValueError(
+                f"docs: the port is out of range ({self.port}, allowed 1 to 65535). Choose another."
+            )
 
 
 Config = ServeDocsConfig

@@ -100,7 +100,7 @@ def record_pick(scene: SceneConfig, config: Config) -> tuple[PickResult, list[Sn
 
 
 def draw_frames(scene: SceneConfig, result: PickResult, snapshots: Sequence[Snapshot]) -> list[Image.Image]:
-    """Return the frames: both views for each snapshot, and between look and transfer the results one by one."""
+    """Return the frames: both views for each snapshot, and before the transfer the results one by one."""
     model = build_model(scene)
     data = mujoco.MjData(model)
     renderer = make_renderer(model, d405.INTRINSICS)

@@ -34,7 +34,7 @@ class Layers:
 def draw_overlay(
     colour: np.ndarray, T_base_camera: np.ndarray, intrinsics: Intrinsics, selection: GraspSelection, layers: Layers
 ) -> np.ndarray:
-    """Return `colour` (H, W, 3) uint8 with the `layers` of `selection` drawn as the camera at `T_base_camera` sees them."""
+    """Return `colour` (H, W, 3) uint8 with `layers` of `selection` as the camera at `T_base_camera` sees them."""
     picture = colour.copy()
     T_base_first = selection.observation.T_base_camera
     if layers.points:
