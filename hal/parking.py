@@ -33,7 +33,7 @@ class Parking:
     """(6,) the folded pose [rad], in which it lies without its motors."""
     speed_rad_s: float = 0.3
     """No joint is faster on the way there [rad/s]."""
-    soften: Callable[[], None] | None = None
+    disable_motors: Callable[[], None] | None = None
     """Lets the motors go, once it lies there and nothing ticks any more; None = they hold."""
 
     def __post_init__(self) -> None:
@@ -56,11 +56,11 @@ def park(servo: Servo, parking: Parking, give_up: Event) -> bool:
         if abs(servo.read_state().tau[z1.N_ARM]) > _SQUEEZES_NM:
             raise CommandRejectedError("the gripper holds something.")
         try:
-            _drive(servo, parking.q, parking.speed_rad_s, give_up)
+            _move_to(servo, parking.q, parking.speed_rad_s, give_up)
         except GuardError as error:
             _LOG.info("parking by way of home: %s", error)
             for station in (z1.Q_HOME, parking.q):
-                _drive(servo, station, parking.speed_rad_s, give_up)
+                _move_to(servo, station, parking.speed_rad_s, give_up)
     except HalError as error:
         _LOG.warning("not parked: %s The arm holds where it is: support it before you switch it off.", error)
         return False
@@ -78,7 +78,7 @@ def _take_over(servo: Servo) -> None:
         servo.heartbeat(_OWNER)
 
 
-def _drive(servo: Servo, station: np.ndarray, speed_rad_s: float, give_up: Event) -> None:
+def _move_to(servo: Servo, station: np.ndarray, speed_rad_s: float, give_up: Event) -> None:
     """Move the arm to `station` (6,) [rad] and wait for it.
 
     Raises:
@@ -88,7 +88,7 @@ def _drive(servo: Servo, station: np.ndarray, speed_rad_s: float, give_up: Event
     """
     status = servo.status()
     goal = np.append(station, status.q_command[z1.N_ARM])
-    motion = _quintic(status.trajectory_id + 1, status.q_command, goal, speed_rad_s, servo.limits)
+    motion = plan_quintic(status.trajectory_id + 1, status.q_command, goal, speed_rad_s, servo.limits)
     servo.stream(motion)
     duration_s, told_s = float(motion.t_s[-1]), -_TELL_S
     while (status := servo.status()).trajectory_id != motion.trajectory_id or not status.finished:
@@ -103,7 +103,7 @@ def _drive(servo: Servo, station: np.ndarray, speed_rad_s: float, give_up: Event
             _LOG.info("parking: %.0f of %.0f s (Ctrl-C again, or `./z1 stop`, ends it)", told_s, duration_s)
 
 
-def _quintic(
+def plan_quintic(
     trajectory_id: int, start: np.ndarray, goal: np.ndarray, speed_rad_s: float, limits: ServoLimits
 ) -> TrajectoryChunk:
     """Return the motion from rest at `start` (7,) to rest at `goal` (7,) [rad] at that speed, or slower for a limit."""

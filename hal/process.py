@@ -21,7 +21,7 @@ from hal.parking import Parking, park
 from hal.rig import Rig
 from hal.servo.guard import Guard, Workspace
 from hal.servo.limits import ServoLimits
-from hal.servo.monitor_only import ReadonlyServo
+from hal.servo.monitor_only import MonitorOnlyServo
 from hal.servo.servo import Servo
 from hal.servo.servo_thread import ServoThread, collect_garbage
 
@@ -34,14 +34,14 @@ _LOOK_S = 0.05
 _COLLECT_EVERY = 1200  # looks: once a minute
 
 
-def stop_on_signals(stop_event: Event, hurry_event: Event | None = None) -> None:
-    """Set `stop_event` at SIGTERM, SIGINT and SIGHUP, and `hurry_event` at the next of them; for the main thread,
+def stop_on_signals(stop_event: Event, force_exit_event: Event | None = None) -> None:
+    """Set `stop_event` at SIGTERM, SIGINT and SIGHUP, and `force_exit_event` at the next of them; for the main thread,
     before `serve`."""
     # A handler interrupts the main thread, which may hold the event's own lock: another thread has to set it.
     heard, told = os.pipe()
 
     def wait() -> None:
-        for event in filter(None, (stop_event, hurry_event)):
+        for event in filter(None, (stop_event, force_exit_event)):
             os.read(heard, 1)
             event.set()
 
@@ -59,7 +59,7 @@ def serve(
     limits: ServoLimits | None = None,
     workspace: Workspace | None = None,
     cpu: int | None = None,
-    hurry_event: Event | None = None,
+    force_exit_event: Event | None = None,
     readonly: bool = False,
 ) -> None:
     """Serve `rig` until `stop_event` is set, then brake, park if the rig says so, hold and let go of everything.
@@ -72,7 +72,7 @@ def serve(
         limits: of the servo; None = the Z1's.
         workspace: where the arm may be; None = above its table.
         cpu: the core for the servo thread; None = any.
-        hurry_event: ends the parking, too: the arm then holds where it is.
+        force_exit_event: ends the parking, too: the arm then holds where it is.
         readonly: measure and publish only; the arm is neither commanded nor stopped nor parked.
 
     Raises:
@@ -81,27 +81,27 @@ def serve(
     """
     if rig.call_every_tick is not None:
         raise InvalidValueError("a lock-step rig has no time of its own to be served by; make it with the wall clock.")
-    kind = ReadonlyServo if readonly else Servo
+    kind = MonitorOnlyServo if readonly else Servo
     servo = kind(rig.arm, rig.clock, limits, heartbeat_timeout_s=HEARTBEAT_TIMEOUT_S)
     ticking = ServoThread(servo, rig.clock, cpu=cpu)
-    ending = _Ending(servo, ticking, rig.park, hurry_event or Event())
+    shutdown = _ShutdownSequence(servo, ticking, rig.park, force_exit_event or Event())
     with ExitStack() as undo:  # in reverse order, whatever of it was reached
-        connect(servo, rig)
+        connect_devices(servo, rig)
         undo.callback(servo.disconnect)
-        undo.callback(ending.soften)
+        undo.callback(shutdown.disable_motors)
         undo.callback(rig.camera.disconnect)
-        servo.keep_inside(Guard(workspace))  # a second to load: whoever has no arm need not wait for it
+        servo.set_safety_guard(Guard(workspace))  # a second to load: whoever has no arm need not wait for it
         ticking.start()
         undo.callback(ticking.stop)
         _await_first_tick(servo, ticking)
         server = undo.enter_context(HalServer(servo, rig.camera, rig.clock, config))
         if not readonly:
-            undo.callback(ending.come_to_rest)
+            undo.callback(shutdown.come_to_rest)
         _LOG.info("serving robot %s at %s", config.robot, config.endpoint)
         if on_ready is not None:
             on_ready()
         for look in itertools.count(1):
-            if stop_event.wait(_LOOK_S) or not ticking.alive:
+            if stop_event.wait(_LOOK_S) or not ticking.is_running:
                 break
             if look % _COLLECT_EVERY == 0:
                 collect_garbage(servo)
@@ -112,11 +112,11 @@ def serve(
 def _await_first_tick(servo: Servo, ticking: ServoThread) -> None:
     """From then on the arm is asked by the servo's thread alone, however many ask the servo."""
     pause = Event()
-    while ticking.alive and not servo.status().ticks:
+    while ticking.is_running and not servo.status().ticks:
         pause.wait(CONTROL_PERIOD_S)
 
 
-def connect(servo: Servo, rig: Rig) -> None:
+def connect_devices(servo: Servo, rig: Rig) -> None:
     """Connect arm and camera; independent ones at the same time, so that whoever has neither learns it of both at once.
 
     Raises:
@@ -159,22 +159,22 @@ class _Attempt(Thread):
             self.error = error
 
 
-class _Ending:
+class _ShutdownSequence:
     """What is done with the arm once the process is to end."""
 
-    def __init__(self, servo: Servo, ticking: ServoThread, parking: Parking | None, hurry: Event) -> None:
+    def __init__(self, servo: Servo, ticking: ServoThread, parking: Parking | None, force_exit: Event) -> None:
         self._servo, self._ticking = servo, ticking
-        self._parking, self._hurry = parking, hurry
+        self._parking, self._force_exit = parking, force_exit
         self._parked = False
 
     def come_to_rest(self) -> None:
         """Brake, and park if that is wanted, while the servo still ticks; clients see it happen, and may stop it."""
-        if self._parking is not None and self._ticking.alive:
-            self._parked = park(self._servo, self._parking, self._hurry)
+        if self._parking is not None and self._ticking.is_running:
+            self._parked = park(self._servo, self._parking, self._force_exit)
         self._servo.stop("the HAL process is ending")
         pause = Event()
         waited_s = 0.0
-        while self._ticking.alive and not self._rests() and waited_s < _BRAKING_S:
+        while self._ticking.is_running and not self._rests() and waited_s < _BRAKING_S:
             pause.wait(_LOOK_S)
             waited_s += _LOOK_S
 
@@ -186,8 +186,8 @@ class _Ending:
             speed = 0.0
         return self._servo.status().mode is ServoMode.STOPPED and bool(speed < _AT_REST_RAD_S)
 
-    def soften(self) -> None:
+    def disable_motors(self) -> None:
         """Let the motors of a parked arm go, if that is wanted; for when nothing ticks any more."""
-        if self._parked and self._parking is not None and self._parking.soften is not None:
-            self._parking.soften()
+        if self._parked and self._parking is not None and self._parking.disable_motors is not None:
+            self._parking.disable_motors()
             _LOG.info("the motors are soft")

@@ -45,7 +45,7 @@ class RemoteArm:
         self._states: Listener | None = None
         self._newest = b""
         self._arrived = threading.Event()
-        self._heart: _Heart | None = None
+        self._heartbeat: _HeartbeatSender | None = None
 
     # --- Life -----------------------------------------------------------------------------------------------------
 
@@ -59,7 +59,7 @@ class RemoteArm:
             return
         link = BusLink(self._config, self._clock, "the remote arm")
         self._arrived.clear()
-        states = Listener(link.session, keys.STATE, self._take_state)
+        states = Listener(link.session, keys.STATE, self._on_state)
         if not self._arrived.wait(self._config.connect_timeout_s):
             states.close()
             link.close()
@@ -76,12 +76,12 @@ class RemoteArm:
             return
         atexit.unregister(self.disconnect)
         try:
-            if self._heart is not None:
+            if self._heartbeat is not None:
                 self.release()
         except HalTimeoutError:
             pass  # there is nobody left to give it back to, and without our heartbeat it lapses
         finally:
-            self._stop_heart()
+            self._stop_heartbeat()
             self._link = self._states = None
             states.close()
             link.close()
@@ -114,7 +114,7 @@ class RemoteArm:
 
     def send(self, setpoint: ArmSetpoint) -> ArmSetpoint:
         """Hand over one setpoint (see `hal.base.arm.Arm.send`)."""
-        return decode(self._connected().ask(keys.SEND, encode(setpoint), self._name()), ArmSetpoint)
+        return decode(self._connected().ask(keys.SEND, encode(setpoint), self._owner_name()), ArmSetpoint)
 
     def stop(self, reason: str = "") -> None:
         """Brake, hold, and latch, whoever holds the lease; returns when the servo has taken it.
@@ -122,7 +122,7 @@ class RemoteArm:
         Raises:
             HalTimeoutError: no answer: use the switch on the arm.
         """
-        self._connected().ask(keys.STOP, reason.encode(), self._name())
+        self._connected().ask(keys.STOP, reason.encode(), self._owner_name())
 
     # --- Servo ----------------------------------------------------------------------------------------------------
 
@@ -135,22 +135,22 @@ class RemoteArm:
         link = self._connected()
         name = f"{owner}-{self._suffix}" if owner else self._owner
         link.ask(keys.CLAIM, owner=name)
-        if self._heart is None or self._heart.owner != name:
-            self._stop_heart()
-            self._heart = _Heart(link.session, name, 1.0 / self._config.heartbeat_rate_hz)
+        if self._heartbeat is None or self._heartbeat.owner != name:
+            self._stop_heartbeat()
+            self._heartbeat = _HeartbeatSender(link.session, name, 1.0 / self._config.heartbeat_rate_hz)
 
     def release(self) -> None:
         """Give the lease back (see `hal.base.arm.ServoedArm.release`)."""
         link = self._connected()
-        name = self._name()
+        name = self._owner_name()
         try:
             link.ask(keys.RELEASE, owner=name)
         finally:
-            self._stop_heart()
+            self._stop_heartbeat()
 
     def stream(self, chunk: TrajectoryChunk) -> None:
         """Queue a piece of a trajectory; returns when the servo has taken it (see `hal.base.arm.ServoedArm.stream`)."""
-        self._connected().ask(keys.CHUNK, encode(chunk), self._name())
+        self._connected().ask(keys.CHUNK, encode(chunk), self._owner_name())
 
     def status(self) -> ServoStatus:
         """Ask the servo for its account of itself.
@@ -161,8 +161,8 @@ class RemoteArm:
 
     def rearm(self) -> None:
         """Lift a latched stop (see `hal.base.arm.ServoedArm.rearm`)."""
-        self._connected().ask(keys.REARM, owner=self._name())
-        self._stop_heart()
+        self._connected().ask(keys.REARM, owner=self._owner_name())
+        self._stop_heartbeat()
 
     # --- Inside ---------------------------------------------------------------------------------------------------
 
@@ -177,20 +177,20 @@ class RemoteArm:
             raise NotConnectedError("the remote arm")
         return self._link
 
-    def _name(self) -> str:
-        return self._heart.owner if self._heart is not None else self._owner
+    def _owner_name(self) -> str:
+        return self._heartbeat.owner if self._heartbeat is not None else self._owner
 
-    def _take_state(self, sample: zenoh.Sample) -> None:
+    def _on_state(self, sample: zenoh.Sample) -> None:
         self._newest = as_bytes(sample.payload)
         self._arrived.set()
 
-    def _stop_heart(self) -> None:
-        if self._heart is not None:
-            self._heart.stop()
-            self._heart = None
+    def _stop_heartbeat(self) -> None:
+        if self._heartbeat is not None:
+            self._heartbeat.stop()
+            self._heartbeat = None
 
 
-class _Heart:
+class _HeartbeatSender:
     """Says `owner` on the heartbeat key, again and again, until stopped."""
 
     def __init__(self, session: zenoh.Session, owner: str, period_s: float) -> None:

@@ -59,10 +59,10 @@ def _is_array(hint: Any) -> bool:
     return hint is np.ndarray or np.ndarray in get_args(hint)
 
 
-def _plain(value: Any, hint: Any, name: str) -> Any:
+def _to_plain(value: Any, hint: Any, name: str) -> Any:
     """Return a field as what msgpack can hold."""
     if is_dataclass(hint) and isinstance(hint, type):
-        return {key: _plain(getattr(value, key), sub, f"{name}.{key}") for key, sub in _schema(hint)}
+        return {key: _to_plain(getattr(value, key), sub, f"{name}.{key}") for key, sub in _schema(hint)}
     if isinstance(hint, type) and issubclass(hint, Enum):
         return value.value
     if hint in (bool, int, float, str):
@@ -72,7 +72,7 @@ def _plain(value: Any, hint: Any, name: str) -> Any:
     raise TypeError(f"{name} has type {hint}, for which the codec has no rule; add one to hal/bus/codec.py.")
 
 
-def _split(message: Any) -> tuple[bytes, list[np.ndarray]]:
+def _split_message(message: Any) -> tuple[bytes, list[np.ndarray]]:
     kind = type(message)
     if MESSAGES.get(kind.__name__) is not kind:
         raise TypeError(f"{kind.__name__} is not a message; known: {', '.join(sorted(MESSAGES))}.")
@@ -81,7 +81,7 @@ def _split(message: Any) -> tuple[bytes, list[np.ndarray]]:
     for name, hint in _schema(kind):
         value = getattr(message, name)
         if not _is_array(hint):
-            plain[name] = _plain(value, hint, f"{kind.__name__}.{name}")
+            plain[name] = _to_plain(value, hint, f"{kind.__name__}.{name}")
         elif value is None:
             plain[name] = None
         else:
@@ -101,13 +101,13 @@ def encode(message: Any) -> bytes:
         TypeError: not a message, or a field type the codec does not know.
         InvalidMessageError: an array whose dtype the wire does not carry (object arrays among them).
     """
-    head, arrays = _split(message)
+    head, arrays = _split_message(message)
     return b"".join([head, *(array.data.cast("B") if array.size else b"" for array in arrays)])
 
 
 def encode_into(message: Any, buffer: bytearray) -> None:
     """Write `message` to `buffer`, whose length is adapted; each array is copied once."""
-    head, arrays = _split(message)
+    head, arrays = _split_message(message)
     total = len(head) + sum(array.nbytes for array in arrays)
     if len(buffer) != total:
         buffer[:] = bytes(total)
@@ -144,11 +144,11 @@ def decode(data: bytes, kind: type | None = None) -> Any:
     for field, hint in schema:
         label = f"{name}.{field}"
         if not _is_array(hint):
-            values[field] = _checked(plain[field], hint, label)
+            values[field] = _check_field(plain[field], hint, label)
         elif plain[field] is None and hint is not np.ndarray:
             values[field] = None
         else:
-            values[field], at = _take_array(body, at, plain[field], _DTYPES.get(field, _FLOAT), label)
+            values[field], at = _read_array(body, at, plain[field], _DTYPES.get(field, _FLOAT), label)
     if at != len(body):
         raise InvalidMessageError(f"{name} has {len(body)} bytes of arrays; its header tells of {at}.")
     return found(**values)
@@ -175,13 +175,13 @@ def _open_envelope(data: bytes) -> tuple[str, dict[Any, Any], memoryview]:
     raise InvalidMessageError(f"the payload's header is {str(header)[:80]}; expected is [type name, fields].")
 
 
-def _checked(value: Any, hint: Any, label: str) -> Any:
+def _check_field(value: Any, hint: Any, label: str) -> Any:
     """Return a plain field as its type; nothing is converted but lists to tuples and values to enum members."""
     if is_dataclass(hint) and isinstance(hint, type):
         schema = _schema(hint)
         if not isinstance(value, dict) or set(value) != {key for key, _ in schema}:
             raise InvalidMessageError(f"{label} is {str(value)[:80]}; needed are the fields {[k for k, _ in schema]}.")
-        return hint(**{key: _checked(value[key], sub, f"{label}.{key}") for key, sub in schema})
+        return hint(**{key: _check_field(value[key], sub, f"{label}.{key}") for key, sub in schema})
     if isinstance(hint, type) and issubclass(hint, Enum):
         known = {member.value: member for member in hint}
         if not isinstance(value, str) or value not in known:
@@ -190,7 +190,7 @@ def _checked(value: Any, hint: Any, label: str) -> Any:
     if get_args(hint) == (str, ...):
         if not isinstance(value, list):
             raise InvalidMessageError(f"{label} is {str(value)[:80]!r}; it must be a list of texts.")
-        return tuple(_checked(item, str, f"{label}[{i}]") for i, item in enumerate(value))
+        return tuple(_check_field(item, str, f"{label}[{i}]") for i, item in enumerate(value))
     if type(value) is not hint:
         raise InvalidMessageError(f"{label} is {str(value)[:80]!r}; it must be of type {hint}.")
     if hint is float and not math.isfinite(value):
@@ -198,7 +198,7 @@ def _checked(value: Any, hint: Any, label: str) -> Any:
     return value
 
 
-def _take_array(body: memoryview, at: int, shape: Any, dtype: np.dtype, label: str) -> tuple[np.ndarray, int]:
+def _read_array(body: memoryview, at: int, shape: Any, dtype: np.dtype, label: str) -> tuple[np.ndarray, int]:
     good = isinstance(shape, list) and len(shape) <= 4 and all(type(n) is int and 0 <= n <= MAX_BYTES for n in shape)
     # Also of an empty array: numpy multiplies the lengths that are not zero.
     if not good or math.prod(max(n, 1) for n in shape) > MAX_BYTES:

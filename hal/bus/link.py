@@ -12,8 +12,8 @@ from hal.bus import keys
 from hal.bus.codec import Hello, decode
 from hal.bus.frames import existing_segments, mapped_segments, unlink_segments
 from hal.bus.service import as_bytes
-from hal.bus.session import BusConfig, nobody_answers, open_session
-from hal.bus.wire_errors import decode_error
+from hal.bus.session import BusConfig, no_answer_error, open_session
+from hal.bus.error_codec import decode_error
 
 _RETRY_S = 0.05
 _SAME_CLOCK_S = 0.05
@@ -42,7 +42,7 @@ class BusLink:
         self.session = open_session(config, listen=False)
         self._segments = mapped_segments() - before
         try:
-            self.hello, self.clock_offset_s = self._greet()
+            self.hello, self.clock_offset_s = self._handshake()
         except HalError:
             self.close()
             raise
@@ -69,7 +69,7 @@ class BusLink:
         # Nothing at once: nobody was asked. Nothing after the timeout: the other end of Zenoh gave up before this one.
         if self._clock.now_s() - asked_s > 0.5 * self._config.request_timeout_s:
             raise self._no_answer(key)
-        raise nobody_answers(self._config)
+        raise no_answer_error(self._config)
 
     def close(self) -> None:
         """End the session."""
@@ -94,7 +94,7 @@ class BusLink:
                 )
             return self._queriers[key]
 
-    def _greet(self) -> tuple[Hello, float]:
+    def _handshake(self) -> tuple[Hello, float]:
         """Return the HAL's hello, and its clock minus ours [s]."""
         give_up_s = self._clock.now_s() + self._config.connect_timeout_s
         pause = threading.Event()

@@ -127,7 +127,7 @@ class RemoteCamera:
             self._waiting += 1
             if self._listener is None:
                 self._last_sequence = None
-                self._listener = Listener(link.session, keys.FRAME, self._take, waiting=_FRAMES_WAITING)
+                self._listener = Listener(link.session, keys.FRAME, self._on_frame, waiting=_FRAMES_WAITING)
         try:
             while True:
                 stamp, payload = self._wait_newer(link, began_s, timeout_s)
@@ -173,7 +173,7 @@ class RemoteCamera:
         self.shared_memory = shared is not None
         return decode(data, RgbdFrame)
 
-    def _take(self, sample: zenoh.Sample) -> None:
+    def _on_frame(self, sample: zenoh.Sample) -> None:
         try:
             stamp = FrameStamp.unpack(as_bytes(sample.attachment))
         except InvalidMessageError as error:

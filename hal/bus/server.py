@@ -30,7 +30,7 @@ from hal.base.messages import ArmSetpoint, ServoHealth, TrajectoryChunk
 from hal.bus import keys
 from hal.bus.codec import VERSION, Hello, decode, decode_text, encode
 from hal.bus.frames import FrameBuffers, FrameStamp, existing_segments, mapped_segments, unlink_segments
-from hal.bus.service import Answer, GuardedThread, Listener, Service, as_bytes
+from hal.bus.service import Answer, ServiceThread, Listener, Service, as_bytes
 from hal.bus.session import BusConfig, open_session
 
 _LOG = logging.getLogger(__name__)
@@ -85,11 +85,11 @@ class HalServer:
             self._buffers.close()
             raise
         self._segments = mapped_segments() - before
-        self._threads: list[GuardedThread] = []
-        self._deaf = _Complaint("a heartbeat is not taken")
+        self._threads: list[ServiceThread] = []
+        self._heartbeat_warning = StateChangeWarning("a heartbeat is not taken")
         self._start_publishing()
         self._services = [
-            Service(self._session, key, answer, self.failed.set, heed_anyone=key == keys.STOP)
+            Service(self._session, key, answer, self.failed.set, allow_anonymous=key == keys.STOP)
             for key, answer in self._answers()
         ]
 
@@ -131,9 +131,9 @@ class HalServer:
         self._heartbeats = Listener(
             session,
             keys.HEARTBEAT,
-            self._take_heartbeat,
+            self._on_heartbeat,
             waiting=_HEARTBEATS_WAITING,
-            on_death=self.failed.set,
+            on_failure=self.failed.set,
         )
         loops: dict[str, Callable[[], None]] = {
             "bus state": self._publish_state,
@@ -141,22 +141,22 @@ class HalServer:
             "bus frames": self._publish_frames,
         }
         for name, loop in loops.items():
-            self._threads.append(GuardedThread(name, loop, self.failed.set))
+            self._threads.append(ServiceThread(name, loop, self.failed.set))
             self._threads[-1].start()
 
     # --- What is published ----------------------------------------------------------------------------------------
 
     def _publish_state(self) -> None:
         period_s = 1.0 / self._config.state_rate_hz
-        complaint = _Complaint("the arm's state is not published")
+        warning = StateChangeWarning("the arm's state is not published")
         due_s = self._clock.now_s()
         while not self._closing.is_set():
             self._status.put(encode(self._servo.status()))  # above all when the arm is silent
             try:
                 self._state.put(encode(self._servo.read_state()))
-                complaint.over()
+                warning.over()
             except HalError as error:
-                complaint.say(error)
+                warning.say(error)
             # Late cycles move the following ones: nothing is sent twice to catch up.
             due_s = max(due_s + period_s, self._clock.now_s())
             self._clock.sleep_until(due_s)
@@ -180,29 +180,29 @@ class HalServer:
                 yield
 
     def _publish_frames(self) -> None:
-        complaint = _Complaint("no frames are published")
+        warning = StateChangeWarning("no frames are published")
         for _ in self._watched():
             try:
                 frame = self._camera.wait_for_frame(_FRAME_TIMEOUT_S)
                 payload = self._buffers.fill(frame)
             except HalError as error:
-                complaint.say(error)
+                warning.say(error)
                 self._closing.wait(_IDLE_S)
                 continue
-            complaint.over()
+            warning.over()
             stamp = FrameStamp(sent_s=self._clock.now_s(), exposed_s=frame.stamp_s, sequence=frame.sequence)
             self._frames.put(payload, attachment=stamp.pack())
 
     # --- What is taken --------------------------------------------------------------------------------------------
 
-    def _take_heartbeat(self, sample: zenoh.Sample) -> None:
+    def _on_heartbeat(self, sample: zenoh.Sample) -> None:
         try:
             self._servo.heartbeat(decode_text(as_bytes(sample.payload), "the heartbeat") or "nobody")
-            self._deaf.over()
+            self._heartbeat_warning.over()
         except LeaseError:
             pass  # a client that has just lost the lease is told so at its next command
         except HalError as error:
-            self._deaf.say(error)
+            self._heartbeat_warning.say(error)
 
     def _answers(self) -> list[tuple[str, Answer]]:
         servo = self._servo
@@ -259,7 +259,7 @@ def _readable(reason: bytes) -> str:
         return ""
 
 
-class _Complaint:
+class StateChangeWarning:
     """Logs a trouble when it begins and when it is over, not at every cycle in between."""
 
     def __init__(self, what: str) -> None:

@@ -15,7 +15,7 @@ import zenoh
 
 from hal.base.errors import HalError, InvalidMessageError
 from hal.bus.codec import decode_text
-from hal.bus.wire_errors import encode_error
+from hal.bus.error_codec import encode_error
 
 _LOG = logging.getLogger(__name__)
 _WAITING = 32
@@ -25,7 +25,7 @@ Answer = Callable[[str, bytes], bytes]
 """Takes the asker's name and the payload, returns the answer's payload; a `HalError` goes back as itself."""
 
 
-def received(handler: Any) -> Iterator[Any]:
+def receive_items(handler: Any) -> Iterator[Any]:
     """Yield what `handler` receives until it is undeclared.
 
     The handler, not its queryable or subscriber, is what a thread may wait on: Zenoh 1.10 refuses to undeclare what
@@ -39,13 +39,13 @@ def received(handler: Any) -> Iterator[Any]:
         yield item
 
 
-class GuardedThread(Thread):
+class ServiceThread(Thread):
     """A daemon thread that reports it when it dies of something nobody expected, and lets the error show."""
 
-    def __init__(self, name: str, run: Callable[[], None], on_death: Callable[[], None]) -> None:
+    def __init__(self, name: str, run: Callable[[], None], on_failure: Callable[[], None]) -> None:
         super().__init__(name=name, daemon=True)
         self._work = run
-        self._on_death = on_death
+        self._on_death = on_failure
 
     def run(self) -> None:
         ended = False
@@ -75,12 +75,12 @@ class Listener:
         take: Callable[[zenoh.Sample], None],
         *,
         waiting: int = 1,
-        on_death: Callable[[], None] = lambda: None,
+        on_failure: Callable[[], None] = lambda: None,
     ) -> None:
         self._take = take
         self._closing = False
         self._subscriber = session.declare_subscriber(key, zenoh.handlers.RingChannel(waiting))
-        self._thread = GuardedThread(f"bus {key}", self._run, on_death)
+        self._thread = ServiceThread(f"bus {key}", self._run, on_failure)
         self._thread.start()
 
     def close(self) -> None:
@@ -91,7 +91,7 @@ class Listener:
             self._thread.join()
 
     def _run(self) -> None:
-        for sample in received(self._subscriber.handler):
+        for sample in receive_items(self._subscriber.handler):
             if self._closing:  # what was still waiting
                 return
             self._take(sample)
@@ -113,16 +113,16 @@ class Service:
         session: zenoh.Session,
         key: str,
         answer: Answer,
-        on_death: Callable[[], None],
+        on_failure: Callable[[], None],
         *,
-        heed_anyone: bool = False,
+        allow_anonymous: bool = False,
     ) -> None:
         self._key = key
         self._answer = answer
-        self._heed_anyone = heed_anyone
+        self._allow_anonymous = allow_anonymous
         # A ring, not a FIFO: a full FIFO would hold up the thread that receives for the whole session.
         self._queryable = session.declare_queryable(key, zenoh.handlers.RingChannel(_WAITING))
-        self._thread = GuardedThread(f"bus {key}", self._run, on_death)
+        self._thread = ServiceThread(f"bus {key}", self._run, on_failure)
         self._thread.start()
 
     def close(self) -> None:
@@ -131,13 +131,13 @@ class Service:
         self._thread.join()
 
     def _run(self) -> None:
-        for query in received(self._queryable.handler):
+        for query in receive_items(self._queryable.handler):
             with query:
                 self._serve(query)
 
     def _serve(self, query: zenoh.Query) -> None:
         try:
-            reply = self._answer(self._asker(query), as_bytes(query.payload))
+            reply = self._answer(self._requester(query), as_bytes(query.payload))
         except HalError as error:
             if isinstance(error, InvalidMessageError):
                 _LOG.warning("%s: refused a malformed request: %s", self._key, error)
@@ -146,11 +146,11 @@ class Service:
         else:
             self._send(lambda: query.reply(self._key, reply, express=True))
 
-    def _asker(self, query: zenoh.Query) -> str:
+    def _requester(self, query: zenoh.Query) -> str:
         try:
             return decode_text(as_bytes(query.attachment), "the asker's name")
         except InvalidMessageError:
-            if self._heed_anyone:
+            if self._allow_anonymous:
                 return ""
             raise
 

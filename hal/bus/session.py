@@ -81,7 +81,7 @@ def open_session(config: BusConfig, *, listen: bool) -> zenoh.Session:
         return zenoh.open(_zenoh_config(config, listen=listen))
     except zenoh.ZError as err:
         if not listen:
-            raise nobody_answers(config) from err
+            raise no_answer_error(config) from err
         if "in use" in str(err):
             raise HalError(
                 f"port {config.port} on {config.host} is taken: another HAL process is running, or another program "
@@ -90,7 +90,7 @@ def open_session(config: BusConfig, *, listen: bool) -> zenoh.Session:
         raise HalError(f"cannot listen on {config.endpoint}: {err}; choose an address of this machine.") from err
 
 
-def nobody_answers(config: BusConfig) -> HalTimeoutError:
+def no_answer_error(config: BusConfig) -> HalTimeoutError:
     """Return the error for a link with nobody at the other end."""
     return HalTimeoutError(
         f"no HAL process answers at {config.endpoint} for robot {config.robot!r}; "

@@ -7,7 +7,7 @@ from ruckig import ControlInterface, InputParameter, Ruckig, Synchronization, Tr
 
 from hal.base.z1 import CONTROL_PERIOD_S, N_JOINTS
 from hal.servo.limits import ServoLimits
-from hal.servo.trajectory_buffer import Playback
+from hal.servo.trajectory_buffer import TrajectoryBuffer
 
 _HARDER = 1.25
 _ATTEMPTS = 10
@@ -72,7 +72,7 @@ class StopPath:
 class PathStop:
     """A stop on the path that is being played: its time runs ever slower, and the arm stays where it was to be."""
 
-    def __init__(self, path: Playback, start_s: float, duration_s: float) -> None:
+    def __init__(self, path: TrajectoryBuffer, start_s: float, duration_s: float) -> None:
         self._path, self._start_s = path, start_s
         self.duration_s = duration_s
         """How long it takes [s]; the path's own time goes on by half of that."""
@@ -84,7 +84,7 @@ class PathStop:
         return q, (1.0 - 3.0 * u**2 + 2.0 * u**3) * dq
 
 
-def plan_path_stop(path: Playback, start_s: float, limits: ServoLimits) -> PathStop | None:
+def plan_path_stop(path: TrajectoryBuffer, start_s: float, limits: ServoLimits) -> PathStop | None:
     """Return the stop on `path` from its time `start_s` [s]; None where too little of it is left to stop on.
 
     It takes as long as the limits of acceleration and jerk want for the speed there, but no longer than `brake_s`.
@@ -96,7 +96,7 @@ def plan_path_stop(path: Playback, start_s: float, limits: ServoLimits) -> PathS
     return PathStop(path, start_s, duration_s) if start_s + 0.5 * duration_s <= path.end_s else None
 
 
-class Chaser:
+class TargetTracker:
     """Moves towards a target that may change every tick, with Ruckig's position interface."""
 
     def __init__(self, limits: ServoLimits) -> None:

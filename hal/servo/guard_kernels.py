@@ -12,7 +12,7 @@ _LINK = np.array([_LINKS.index(capsule.link) for capsule in CAPSULES])
 _ENDS = np.array([(capsule.start, capsule.end) for capsule in CAPSULES])
 _RADII = np.array([capsule.radius_m for capsule in CAPSULES])
 _MAY_MEET_TABLE = np.array([capsule.link in TABLE_LINKS for capsule in CAPSULES])
-_MAY_MEET_HAND = np.array([capsule.link in GRIPPER_OBSTACLES for capsule in CAPSULES])
+_MAY_MEET_GRIPPER = np.array([capsule.link in GRIPPER_OBSTACLES for capsule in CAPSULES])
 AXES = "ZYYYZX"
 """About which axis of its own each arm joint turns."""
 _AXIS = np.array(["XYZ".index(axis) for axis in AXES])
@@ -112,6 +112,6 @@ def measure_margins(q, joints, lower, upper, T_flange_pivot):
             for a in range(3):
                 box[k] = min(box[k], point[a] - lower[a], upper[a] - point[a])
             for c in range(len(_RADII)):
-                if _MAY_MEET_HAND[c]:
+                if _MAY_MEET_GRIPPER[c]:
                     own[k] = min(own[k], np.sqrt(squared_distance(point, ends[c, 0], ends[c, 1])) - _RADII[c])
     return box, table, own

@@ -17,12 +17,12 @@ class Lease:
         self._timeout_s = timeout_s
         self.owner = ""
         """The last one who claimed it and has not released it; empty when nobody."""
-        self.beat_s = 0.0
+        self.last_heartbeat_s = 0.0
         """When he was last heard [s]."""
 
-    def holder(self, now_s: float, *, at_rest: bool) -> str:
+    def current_owner(self, now_s: float, *, at_rest: bool) -> str:
         """Return who holds it at `now_s` [s]; empty when nobody does or it has lapsed."""
-        lapsed = self._timeout_s is not None and at_rest and now_s - self.beat_s > self._timeout_s
+        lapsed = self._timeout_s is not None and at_rest and now_s - self.last_heartbeat_s > self._timeout_s
         return "" if lapsed else self.owner
 
     def claim(self, owner: str, now_s: float, *, at_rest: bool) -> None:
@@ -33,12 +33,12 @@ class Lease:
         """
         if not owner:
             raise LeaseError("the owner of a lease needs a name that is not empty.")
-        holder = self.holder(now_s, at_rest=at_rest)
-        if holder not in ("", owner):
-            raise LeaseError(f"the arm is commanded by {holder!r}; {owner!r} has to wait until that one releases it.")
-        self.owner, self.beat_s = owner, now_s
+        current_owner = self.current_owner(now_s, at_rest=at_rest)
+        if current_owner not in ("", owner):
+            raise LeaseError(f"the arm is commanded by {current_owner!r}; {owner!r} has to wait until that one releases it.")
+        self.owner, self.last_heartbeat_s = owner, now_s
 
-    def beat(self, owner: str | None, now_s: float) -> None:
+    def renew(self, owner: str | None, now_s: float) -> None:
         """The owner (None = whoever holds it) was heard at `now_s` [s].
 
         Raises:
@@ -48,7 +48,7 @@ class Lease:
             raise LeaseError("nobody holds the arm's lease; claim() it first.")
         if owner not in (None, self.owner):
             raise LeaseError(f"the arm is commanded by {self.owner!r}, not by {owner!r}; claim() it first.")
-        self.beat_s = now_s
+        self.last_heartbeat_s = now_s
 
     def clear(self) -> None:
         """Nobody holds it."""

@@ -124,7 +124,7 @@ def find_blocked(limits: ServoLimits, q_command: np.ndarray, q_measured: np.ndar
     )
 
 
-class OverloadWatch:
+class OverloadDetector:
     """Counts how long a motor has been at its torque limit, or asked for more than that."""
 
     def __init__(self, limits: ServoLimits) -> None:
@@ -140,7 +140,7 @@ class OverloadWatch:
 
         Args:
             tau: (7,) measured [Nm].
-            asked: (7,) what the position servos make of the command [Nm] (`servo_torque`).
+            asked: (7,) what the position servos make of the command [Nm] (`compute_servo_torque`).
         """
         over = np.abs(np.stack([tau[:_GRIPPER], asked[:_GRIPPER]])) >= self._levels
         if not over.any():
@@ -159,6 +159,6 @@ class OverloadWatch:
         return f"{z1.JOINT_NAMES[joint]} {what} for more than {allowed_s:.2f} s: it is blocked, overloaded or lost"
 
 
-def servo_torque(q_command: np.ndarray, q_measured: np.ndarray) -> np.ndarray:
+def compute_servo_torque(q_command: np.ndarray, q_measured: np.ndarray) -> np.ndarray:
     """Return the torques (7,) [Nm] that the arm's position servos make of a command (7,) [rad] beside gravity's."""
     return z1.KP * (q_command - q_measured)

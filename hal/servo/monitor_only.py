@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from hal.base.errors import CommandRejectedError, LeaseError
-from hal.servo.control_loop import WatchingCycle
+from hal.servo.control_loop import MonitorOnlyCycle
 from hal.servo.servo import Servo
 
 _WHY = "this HAL only watches (--readonly) and commands nothing"
 
 
-class ReadonlyServo(Servo):
+class MonitorOnlyServo(Servo):
     """A servo whose ticks measure, publish, and no more. What the arm reports latches as usual, and is told."""
 
-    cycle_type = WatchingCycle
+    cycle_type = MonitorOnlyCycle
 
     def claim(self, owner: str) -> None:
         """Refuse.

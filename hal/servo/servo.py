@@ -1,7 +1,7 @@
 """The 500 Hz servo above any arm: plays trajectories, enforces limits, brakes, holds, and latches the stop.
 
 Threads: one thread (or the lock-step clock) calls `tick`; any thread may call the rest. The tick takes no lock: what
-producers ask for waits in `hal.servo.command_mailbox.Orders`, what the tick tells them is one immutable snapshot a
+producers ask for waits in `hal.servo.command_mailbox.CommandMailbox`, what the tick tells them is one immutable snapshot a
 tick.
 """
 
@@ -11,12 +11,12 @@ from hal.base.arm import Arm
 from hal.base.clock import Clock
 from hal.base.errors import CommandRejectedError, HalError, HalTimeoutError, NotConnectedError
 from hal.base.messages import ArmSetpoint, ArmState, ServoHealth, ServoMode, ServoStatus, TrajectoryChunk
-from hal.servo.command_mailbox import Orders, Snapshot
-from hal.servo.control_loop import Cycle
+from hal.servo.command_mailbox import CommandMailbox, Snapshot
+from hal.servo.control_loop import ControlCycle
 from hal.servo.guard import Guard
 from hal.servo.limits import ServoLimits, clip_setpoint
 from hal.servo.periods import PeriodStatistics
-from hal.servo.status import Teller, make_health, make_status
+from hal.servo.status import StatusLogger, make_health, make_status
 
 _STATE_MAX_AGE_S = 0.2
 
@@ -36,7 +36,7 @@ class Servo:
         guard: keeps the arm above the table, in its workspace and off itself; None leaves the joint limits alone.
     """
 
-    cycle_type: type[Cycle] = Cycle
+    cycle_type: type[ControlCycle] = ControlCycle
     """What a tick does."""
 
     def __init__(
@@ -58,7 +58,7 @@ class Servo:
         """What the thread that ticks was granted, for `health`."""
         self._heartbeat_timeout_s = heartbeat_timeout_s
         self._send_timeout_s = send_timeout_s
-        self._orders = Orders(self.limits, None if heartbeat_timeout_s is None else lease_timeout_s, guard)
+        self._mailbox = CommandMailbox(self.limits, None if heartbeat_timeout_s is None else lease_timeout_s, guard)
         self._snapshot: Snapshot | None = None  # replaced by the tick
         self._ticked = False
 
@@ -78,26 +78,26 @@ class Servo:
         except HalError:
             self.arm.disconnect()
             raise
-        self._orders.reset()
-        self._teller, self._ticked = Teller(), False
+        self._mailbox.reset()
+        self._status_log, self._ticked = StatusLogger(), False
         self._cycle = self.cycle_type(
             self.arm,
             self.limits,
-            self._orders,
+            self._mailbox,
             state,
             heartbeat_timeout_s=self._heartbeat_timeout_s,
             send_timeout_s=self._send_timeout_s,
         )
         self._snapshot = self._cycle.snapshot(self.clock.now_s())
 
-    def keep_inside(self, guard: Guard) -> None:
+    def set_safety_guard(self, guard: Guard) -> None:
         """Let `guard` check whatever is commanded from now on; for before anything ticks."""
-        self._orders.guard = guard
+        self._mailbox.guard = guard
 
     def disconnect(self) -> None:
         """Let go of the arm, which holds where it is. Brake first (`stop`) if it moves; end a `ServoThread` first."""
         self._snapshot = None
-        self._orders.lease.clear()
+        self._mailbox.lease.clear()
         self.arm.disconnect()
 
     def _connected(self) -> Snapshot:
@@ -130,11 +130,11 @@ class Servo:
 
     def claim(self, owner: str) -> None:
         """Take the command lease (see `hal.base.arm.ServoedArm.claim`)."""
-        self._orders.claim(owner, self.clock.now_s(), at_rest=self._connected().at_rest)
+        self._mailbox.claim(owner, self.clock.now_s(), at_rest=self._connected().at_rest)
 
     def release(self, owner: str | None = None) -> None:
         """Give the lease back; a running motion is braked first. Harmless when not held (by `owner`)."""
-        self._orders.release(owner)
+        self._mailbox.release(owner)
 
     def heartbeat(self, owner: str | None = None) -> None:
         """Say that the lease's owner is alive.
@@ -142,15 +142,15 @@ class Servo:
         Raises:
             LeaseError: `owner` does not hold the lease.
         """
-        self._orders.beat(owner, self.clock.now_s())
+        self._mailbox.renew(owner, self.clock.now_s())
 
     def stop(self, reason: str = "stop requested") -> None:
         """Brake at the next tick, then hold; every command is refused until `rearm()`. Queued motion is dropped."""
-        self._orders.stop(reason)
+        self._mailbox.stop(reason)
 
     def fail(self, reason: str) -> None:
         """Latch and stop the arm itself: for a driver whose tick cannot go on."""
-        self._orders.stop(reason)
+        self._mailbox.stop(reason)
         snapshot = self._snapshot
         if snapshot is not None:
             self._snapshot = snapshot._replace(mode=ServoMode.STOPPED, reason=reason)
@@ -159,14 +159,14 @@ class Servo:
     def rearm(self) -> None:
         """Lift a latched stop; the arm holds where it is and the lease is free. No effect when not stopped."""
         self._connected()
-        self._orders.rearm()
+        self._mailbox.rearm()
 
     def stream(self, chunk: TrajectoryChunk, owner: str | None = None) -> None:
         """Queue a piece of a trajectory (see `hal.base.arm.ServoedArm.stream`).
 
         Args:
             chunk: the piece.
-            owner: who sends it; None = the holder of the lease, in this process.
+            owner: who sends it; None = the current_owner of the lease, in this process.
 
         Raises:
             NotConnectedError, StoppedError, LeaseError, CommandRejectedError: it was not queued.
@@ -174,7 +174,7 @@ class Servo:
         snapshot = self._connected()
         if not isinstance(chunk, TrajectoryChunk):
             raise CommandRejectedError(f"stream() takes a TrajectoryChunk, not a {type(chunk).__name__}.")
-        self._orders.stream(chunk, owner, self.clock.now_s(), snapshot)
+        self._mailbox.stream(chunk, owner, self.clock.now_s(), snapshot)
 
     def send(self, setpoint: ArmSetpoint, owner: str | None = None) -> ArmSetpoint:
         """Move towards one setpoint within all limits; return it clipped to the joints' limits and a tick's reach.
@@ -189,7 +189,7 @@ class Servo:
         snapshot = self._connected()
         if not isinstance(setpoint, ArmSetpoint):
             raise CommandRejectedError(f"send() takes an ArmSetpoint, not a {type(setpoint).__name__}.")
-        self._orders.send(setpoint, owner, self.clock.now_s(), snapshot)
+        self._mailbox.send(setpoint, owner, self.clock.now_s(), snapshot)
         allowed = clip_setpoint(
             self.limits,
             setpoint.q,
@@ -204,12 +204,12 @@ class Servo:
         """Return the servo's account of its last tick; built on request, so that the tick need not."""
         snapshot = self._connected()
         now_s = self.clock.now_s()
-        self._teller.tell(self._orders.latch, self._cycle.clips + self._orders.beyond, now_s)
-        return make_status(snapshot, self._orders, self.periods, now_s)
+        self._status_log.log_changes(self._mailbox.latch, self._cycle.clipped_count + self._mailbox.out_of_limits_count, now_s)
+        return make_status(snapshot, self._mailbox, self.periods, now_s)
 
     def health(self) -> ServoHealth:
         """Return how well the servo does its work."""
-        return make_health(self._connected(), self._orders, self.periods, self.real_time, self.clock.now_s())
+        return make_health(self._connected(), self._mailbox, self.periods, self.real_time, self.clock.now_s())
 
     # --- The tick -----------------------------------------------------------------------------------------------
 

@@ -70,7 +70,7 @@ class ServoThread:
             raise self._error
 
     @property
-    def alive(self) -> bool:
+    def is_running(self) -> bool:
         """Whether it ticks."""
         return self._thread is not None and self._thread.is_alive()
 

@@ -22,7 +22,7 @@ _ROUGHNESS = 1.05  # cubics through samples of a smooth motion overshoot its acc
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Playback:
+class TrajectoryBuffer:
     """What is buffered of one trajectory; never changed, only replaced, so that the tick needs no lock to read it."""
 
     trajectory_id: int
@@ -57,13 +57,13 @@ class Playback:
         dq = (6 * s * (1 - s) / h) * rise + (1 - s) * (1 - 3 * s) * da + s * (3 * s - 2) * db
         return q, dq
 
-    def sampled(self, start_s: float, spacing_s: float) -> np.ndarray:
+    def sample_positions(self, start_s: float, spacing_s: float) -> np.ndarray:
         """Return positions (N, 7) [rad] every `spacing_s` from `start_s` to the end [s]."""
         times = np.arange(start_s, self.end_s, spacing_s)
         return np.array([self.at(float(t_s))[0] for t_s in (*times, self.end_s)])
 
 
-def begin(chunk: TrajectoryChunk, limits: ServoLimits) -> Playback:
+def begin(chunk: TrajectoryChunk, limits: ServoLimits) -> TrajectoryBuffer:
     """Return the playback of a new trajectory's first chunk.
 
     Raises:
@@ -74,10 +74,10 @@ def begin(chunk: TrajectoryChunk, limits: ServoLimits) -> Playback:
             f"trajectory {chunk.trajectory_id} starts at {chunk.t_s[0]:.4f} s; the first chunk starts at 0."
         )
     _check_points(chunk.trajectory_id, chunk.t_s, chunk.q, chunk.dq, limits)
-    return Playback(chunk.trajectory_id, chunk.t_s.tolist(), chunk.q, chunk.dq, chunk.final)
+    return TrajectoryBuffer(chunk.trajectory_id, chunk.t_s.tolist(), chunk.q, chunk.dq, chunk.final)
 
 
-def extend(old: Playback, chunk: TrajectoryChunk, played_s: float, limits: ServoLimits) -> Playback:
+def extend(old: TrajectoryBuffer, chunk: TrajectoryChunk, played_s: float, limits: ServoLimits) -> TrajectoryBuffer:
     """Return `old` without what has been played (before `played_s` [s]) and with `chunk` behind it.
 
     Raises:
@@ -106,7 +106,7 @@ def extend(old: Playback, chunk: TrajectoryChunk, played_s: float, limits: Servo
     q = np.concatenate([old.q[keep:], chunk.q[skip:]])
     dq = np.concatenate([old.dq[keep:], chunk.dq[skip:]])
     _check_points(chunk.trajectory_id, t_s, q, dq, limits)
-    return Playback(chunk.trajectory_id, t_s.tolist(), q, dq, chunk.final)
+    return TrajectoryBuffer(chunk.trajectory_id, t_s.tolist(), q, dq, chunk.final)
 
 
 def _check_points(trajectory_id: int, t_s: np.ndarray, q: np.ndarray, dq: np.ndarray, limits: ServoLimits) -> None:
@@ -137,7 +137,7 @@ def _check_points(trajectory_id: int, t_s: np.ndarray, q: np.ndarray, dq: np.nda
 
 
 def _check_smoothness(trajectory_id: int, t_s: np.ndarray, q: np.ndarray, dq: np.ndarray, limits: ServoLimits) -> None:
-    """Refuse accelerations and jerks beyond the limits: of the cubics that `Playback.at` lays through the points."""
+    """Refuse accelerations and jerks beyond the limits: of the cubics that `TrajectoryBuffer.at` lays through the points."""
     h = np.diff(t_s)[:, None]
     slope = np.diff(q, axis=0) / h
     before = (6.0 * slope - 4.0 * dq[:-1] - 2.0 * dq[1:]) / h

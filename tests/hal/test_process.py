@@ -150,7 +150,7 @@ def test_a_rig_that_is_parked_goes_soft_when_nothing_ticks_any_more_and_before_i
     rig, end = make_rig(), Event()
     folded = np.append(np.zeros(5), 1.0)
     softened: list[np.ndarray] = []
-    parking = Parking(q=folded, speed_rad_s=3.0, soften=lambda: softened.append(rig.arm.read_state().q))
+    parking = Parking(q=folded, speed_rad_s=3.0, disable_motors=lambda: softened.append(rig.arm.read_state().q))
     serve(replace(rig, park=parking), free_config(), end, on_ready=end.set)
     assert softened[0][:6] == pytest.approx(folded, abs=1e-2)
 
@@ -164,7 +164,7 @@ def test_an_arm_that_was_stopped_is_neither_parked_nor_softened() -> None:
             arm.stop("the button")
         end.set()
 
-    parking = Parking(q=np.zeros(6), speed_rad_s=3.0, soften=lambda: softened.append(True))
+    parking = Parking(q=np.zeros(6), speed_rad_s=3.0, disable_motors=lambda: softened.append(True))
     serve(replace(rig, park=parking), config, end, on_ready=stop)
     assert softened == []
 

@@ -29,7 +29,7 @@ from hal.bus.codec import decode, encode
 from hal.bus.frames import FrameBuffers, FrameStamp
 from hal.bus.service import Listener, as_bytes
 from hal.bus.session import BusConfig, open_session
-from hal.bus.wire_errors import decode_error
+from hal.bus.error_codec import decode_error
 from tests.support.faults_table import FaultsTable, describe
 from tests.support.hal.bus_hal import moving, slow_motion, wait_until
 

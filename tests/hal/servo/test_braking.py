@@ -7,9 +7,9 @@ import pytest
 
 from hal.base.messages import TrajectoryChunk
 from hal.base.z1 import CONTROL_PERIOD_S, DDQ_MAX, DQ_MAX, N_JOINTS, Q_MAX, Q_MIN
-from hal.servo.braking import Blend, Brake, Chaser, plan_path_stop
+from hal.servo.braking import Blend, Brake, TargetTracker, plan_path_stop
 from hal.servo.limits import ServoLimits
-from hal.servo.trajectory_buffer import Playback
+from hal.servo.trajectory_buffer import TrajectoryBuffer
 from tests.support.hal.servo_bench import START, Bench
 
 LIMITS = ServoLimits()
@@ -51,7 +51,7 @@ def test_a_blend_dies_out_within_the_acceleration_limits() -> None:
 
 
 def test_a_chase_arrives_at_the_limit_when_its_target_lies_beyond() -> None:
-    chaser = Chaser(LIMITS)
+    chaser = TargetTracker(LIMITS)
     q, dq, ddq = MIDDLE, ZERO, ZERO
     for _ in range(1500):
         q, dq, ddq = chaser.step(Q_MAX + 1.0, q, dq, ddq)
@@ -65,14 +65,14 @@ def test_a_chase_arrives_at_the_limit_when_its_target_lies_beyond() -> None:
 # --- On the path ----------------------------------------------------------------------------------------------------
 
 
-def circle(duration_s: float, speed: float = 1.0) -> Playback:
+def circle(duration_s: float, speed: float = 1.0) -> TrajectoryBuffer:
     """Joints 1 and 2 go round a circle of 0.3 rad: no straight line, which every way of braking would stay on."""
     t_s = np.arange(0.0, duration_s + 1e-9, 0.02)
     q, dq = np.zeros((len(t_s), N_JOINTS)), np.zeros((len(t_s), N_JOINTS))
     turn = speed / 0.3
     q[:, 0], q[:, 1] = 0.3 * np.cos(turn * t_s), 0.3 * np.sin(turn * t_s)
     dq[:, 0], dq[:, 1] = -speed * np.sin(turn * t_s), speed * np.cos(turn * t_s)
-    return Playback(1, t_s.tolist(), q, dq, False)
+    return TrajectoryBuffer(1, t_s.tolist(), q, dq, False)
 
 
 @pytest.mark.parametrize("speed", [0.05, 0.5, 1.0])

@@ -177,7 +177,7 @@ def test_a_silent_lease_lapses_once_nothing_moves() -> None:
 def test_what_was_taken_while_the_tick_found_a_fault_is_dropped_by_the_rearming() -> None:
     bench = Bench()
     bench.servo.stream(move())
-    bench.servo._orders.latch = "a fault"  # as the tick does, which takes no lock
+    bench.servo._mailbox.latch = "a fault"  # as the tick does, which takes no lock
     bench.servo.rearm()
     bench.servo.claim("test")
     bench.run(0.2)

@@ -7,7 +7,7 @@ import pytest
 
 from hal.base.errors import InvalidMessageError
 from hal.base.z1 import CONTROL_PERIOD_S, DQ_MAX, KP, N_ARM, N_JOINTS, Q_MAX, Q_MIN
-from hal.servo.limits import ClippedSetpoint, OverloadWatch, ServoLimits, clip_setpoint, find_blocked, servo_torque
+from hal.servo.limits import ClippedSetpoint, OverloadDetector, ServoLimits, clip_setpoint, find_blocked, compute_servo_torque
 
 LIMITS = ServoLimits()
 MIDDLE = (Q_MIN + Q_MAX) / 2
@@ -100,7 +100,7 @@ def test_a_joint_that_does_not_follow_is_named() -> None:
 
 
 def test_a_motor_may_be_at_its_limit_for_a_tenth_of_a_second() -> None:
-    watch = OverloadWatch(LIMITS)
+    watch = OverloadDetector(LIMITS)
     tau = ZERO.copy()
     tau[2] = -30.0
     assert [watch.update(tau, ZERO) for _ in range(50)] == [""] * 50
@@ -108,24 +108,24 @@ def test_a_motor_may_be_at_its_limit_for_a_tenth_of_a_second() -> None:
 
 
 def test_a_command_may_ask_for_more_than_a_motor_has_for_a_tenth_of_a_second() -> None:
-    watch = OverloadWatch(LIMITS)
+    watch = OverloadDetector(LIMITS)
     command = MIDDLE.copy()
     command[0] += 0.048
-    asked = servo_torque(command, MIDDLE)
+    asked = compute_servo_torque(command, MIDDLE)
     assert asked[0] == pytest.approx(0.048 * 640)
     assert [watch.update(ZERO, asked) for _ in range(50)] == [""] * 50
     assert "joint1 does not follow: its command has asked for 30.7 Nm (allowed 30.0)" in watch.update(ZERO, asked)
 
 
 def test_a_gripper_may_be_asked_for_all_it_has() -> None:
-    watch = OverloadWatch(LIMITS)
+    watch = OverloadDetector(LIMITS)
     asked = ZERO.copy()
     asked[N_ARM] = 60.0
     assert [watch.update(asked, asked) for _ in range(100)] == [""] * 100
 
 
 def test_short_peaks_of_different_motors_do_not_add_up() -> None:
-    watch = OverloadWatch(LIMITS)
+    watch = OverloadDetector(LIMITS)
     for tick in range(300):
         tau = ZERO.copy()
         tau[tick // 40 % 2] = 60.0

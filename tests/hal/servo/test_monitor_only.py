@@ -10,7 +10,7 @@ from hal.base.clock import ManualClock
 from hal.base.errors import CommandRejectedError, LeaseError
 from hal.base.messages import ArmSetpoint, ServoMode
 from hal.base.z1 import CONTROL_PERIOD_S
-from hal.servo.monitor_only import ReadonlyServo
+from hal.servo.monitor_only import MonitorOnlyServo
 from tests.support.hal.servo_bench import START, move, setpoint
 
 
@@ -27,7 +27,7 @@ class HandledArm(MockArm):
 def test_it_tells_where_the_arm_is_and_sends_nothing() -> None:
     clock = ManualClock(5.0)
     arm = HandledArm(clock, q=START)
-    servo = ReadonlyServo(arm, clock)
+    servo = MonitorOnlyServo(arm, clock)
     servo.connect()
     for _ in range(500):
         arm.push(1e-3)
@@ -42,7 +42,7 @@ def test_it_tells_where_the_arm_is_and_sends_nothing() -> None:
 
 def test_it_refuses_whoever_wants_the_arm() -> None:
     clock = ManualClock(5.0)
-    servo = ReadonlyServo(HandledArm(clock, q=START), clock)
+    servo = MonitorOnlyServo(HandledArm(clock, q=START), clock)
     servo.connect()
     servo.tick()
     with pytest.raises(LeaseError, match=r"'demo' cannot have the arm\. Start it again without --readonly"):
@@ -57,7 +57,7 @@ def test_it_refuses_whoever_wants_the_arm() -> None:
 def test_a_fault_of_the_arm_is_told() -> None:
     clock = ManualClock(5.0)
     arm = HandledArm(clock, q=START)
-    servo = ReadonlyServo(arm, clock)
+    servo = MonitorOnlyServo(arm, clock)
     servo.connect()
     arm.inject_fault("overheat joint 2")
     servo.tick()

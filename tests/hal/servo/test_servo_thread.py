@@ -65,7 +65,7 @@ def test_a_servo_on_the_wall_clock_plays_a_trajectory_and_measures_its_periods()
     servo.stream(move(duration_s=1.0))
     while not (servo.status().finished or servo.status().reason):
         clock.sleep_until(clock.now_s() + 0.02)
-    assert thread.alive
+    assert thread.is_running
     thread.stop()
     thread.stop()
     status = servo.status()
@@ -85,7 +85,7 @@ def test_what_a_tick_raises_latches_a_stop_and_comes_out_when_the_thread_is_ende
     thread = ServoThread(servo, clock)
     thread.start()
     monkeypatch.setattr(arm, "read_state", lambda: 1 / 0)
-    while thread.alive:
+    while thread.is_running:
         clock.sleep_until(clock.now_s() + 0.005)
     status = servo.status()
     assert status.mode is ServoMode.STOPPED

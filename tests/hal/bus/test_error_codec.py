@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 import hal.base.errors
 from hal.base.errors import HalError, LeaseError, NotConnectedError, StoppedError, UnknownBackendError
-from hal.bus.wire_errors import decode_error, encode_error
+from hal.bus.error_codec import decode_error, encode_error
 
 _BUILT = {
     NotConnectedError: NotConnectedError("the arm"),
