@@ -10,10 +10,10 @@ from hal.base.clock import Clock
 from hal.base.errors import HalError, HalTimeoutError, NotConnectedError
 from hal.bus import keys
 from hal.bus.codec import Hello, decode
+from hal.bus.error_codec import decode_error
 from hal.bus.frames import existing_segments, mapped_segments, unlink_segments
 from hal.bus.service import as_bytes
 from hal.bus.session import BusConfig, no_answer_error, open_session
-from hal.bus.error_codec import decode_error
 
 _RETRY_S = 0.05
 _SAME_CLOCK_S = 0.05

@@ -30,7 +30,7 @@ from hal.base.messages import ArmSetpoint, ServoHealth, TrajectoryChunk
 from hal.bus import keys
 from hal.bus.codec import VERSION, Hello, decode, decode_text, encode
 from hal.bus.frames import FrameBuffers, FrameStamp, existing_segments, mapped_segments, unlink_segments
-from hal.bus.service import Answer, ServiceThread, Listener, Service, as_bytes
+from hal.bus.service import Answer, Listener, Service, ServiceThread, as_bytes
 from hal.bus.session import BusConfig, open_session
 
 _LOG = logging.getLogger(__name__)

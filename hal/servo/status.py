@@ -1,4 +1,4 @@
-"""What the servo says of itself: its status on request, and the log lines that its tick must not write."""
+"""Status and health of the servo, built on request, and the log lines that the tick must not write."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from hal.servo.periods import PeriodStatistics
 
 log = logging.getLogger(__name__)
 
-_WARN_EVERY_S = 1.0
+_WARNING_PERIOD_S = 1.0  # a clipped stream clips at 500 Hz: one line a second is enough to read
 
 
 def make_status(snapshot: Snapshot, mailbox: CommandMailbox, periods: PeriodStatistics, now_s: float) -> ServoStatus:
-    """Return the status that the last tick's `snapshot`, the `mailbox` and the measured `periods` amount to."""
+    """Return the status from the last tick's `snapshot`, the `mailbox` and the measured `periods`."""
     summary = periods.summary()
-    active_trajectory = mailbox.active_trajectory
+    active = mailbox.active_trajectory
     buffered_s = 0.0
-    if active_trajectory is not None:
-        played_s = snapshot.trajectory_time_s if active_trajectory.trajectory_id == snapshot.trajectory_id else 0.0
-        buffered_s = max(active_trajectory.end_s - played_s, 0.0)
+    if active is not None:
+        played_s = snapshot.trajectory_time_s if active.trajectory_id == snapshot.trajectory_id else 0.0
+        buffered_s = max(active.end_s - played_s, 0.0)
     return ServoStatus(
         stamp_s=snapshot.stamp_s,
         mode=snapshot.mode,
@@ -43,7 +43,7 @@ def make_status(snapshot: Snapshot, mailbox: CommandMailbox, periods: PeriodStat
 def make_health(
     snapshot: Snapshot, mailbox: CommandMailbox, periods: PeriodStatistics, real_time: tuple[str, ...], now_s: float
 ) -> ServoHealth:
-    """Return the health that the same amount to, of a thread that was granted `real_time`."""
+    """Return the health from the same inputs, for a thread that was granted `real_time`."""
     summary = periods.summary()
     owner = mailbox.lease.current_owner(now_s, at_rest=snapshot.at_rest)
     return ServoHealth(
@@ -64,18 +64,24 @@ def make_health(
 
 
 class StatusLogger:
-    """Logs each latched stop once, and clipped setpoints once a second; called by whoever asks for the status."""
+    """Logger of latched stops, once each, and of clipped setpoints, once a second; run by each status request."""
 
     def __init__(self) -> None:
         self._latch = ""
-        self._clips = 0
+        self._clipped_count = 0
         self._logged_s = -np.inf
 
     def log_changes(self, latch: str, clipped_count: int, now_s: float) -> None:
-        """Log what is new: `latch`, why the servo is stopped, and `clipped_count`, how many setpoints were clipped so far."""
+        """Log the changes since the last call.
+
+        Args:
+            latch: reason of the latched stop; empty when the servo is not stopped.
+            clipped_count: setpoints that the limits have changed so far.
+            now_s: time of the call [s].
+        """
         if latch != self._latch:
             self._latch = latch
             log.info("servo: %s", f"stopped: {latch}" if latch else "re-armed")
-        if clipped_count != self._clips and now_s - self._logged_s >= _WARN_EVERY_S:
-            log.warning("servo: %d setpoints were clipped to the limits.", clipped_count - self._clips)
-            self._clips, self._logged_s = clipped_count, now_s
+        if clipped_count != self._clipped_count and now_s - self._logged_s >= _WARNING_PERIOD_S:
+            log.warning("servo: %d setpoints were clipped to the limits.", clipped_count - self._clipped_count)
+            self._clipped_count, self._logged_s = clipped_count, now_s

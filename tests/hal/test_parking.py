@@ -98,9 +98,9 @@ def test_where_the_straight_way_is_forbidden_it_goes_by_way_of_home(caplog: pyte
     """From this pose the straight way to the folded one takes the arm through itself."""
     low = np.array([0.95, 2.1, -0.92, 0.81, -1.13, -2.2, -0.5])
     guard = Guard()
-    assert guard.refusal(low[None], np.append(z1.Q_HOME, 0.0)) is None
+    assert guard.find_violation(low[None], np.append(z1.Q_HOME, 0.0)) is None
     share = np.linspace(0.0, 1.0, 100)[:, None]
-    assert guard.refusal(low + share * (np.append(FOLDED, -0.5) - low), low) is not None
+    assert guard.find_violation(low + share * (np.append(FOLDED, -0.5) - low), low) is not None
     with caplog.at_level(logging.INFO, logger="hal.parking"), ticking(guard, low) as (servo, arm):
         assert park(servo, QUICK, Event())
         assert arm.read_state().q[: z1.N_ARM] == pytest.approx(FOLDED, abs=1e-2)

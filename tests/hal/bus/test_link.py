@@ -26,10 +26,10 @@ from hal.base.z1 import Q_HOME
 from hal.bus import keys
 from hal.bus.client import RemoteArm, RemoteCamera
 from hal.bus.codec import decode, encode
+from hal.bus.error_codec import decode_error
 from hal.bus.frames import FrameBuffers, FrameStamp
 from hal.bus.service import Listener, as_bytes
 from hal.bus.session import BusConfig, open_session
-from hal.bus.error_codec import decode_error
 from tests.support.faults_table import FaultsTable, describe
 from tests.support.hal.bus_hal import moving, slow_motion, wait_until
 

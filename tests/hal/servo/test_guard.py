@@ -46,7 +46,7 @@ def test_its_kinematics_are_the_urdfs(shares: list[float]) -> None:
     T = pivot(q)
     corners = GRIPPER_POINTS @ T[:3, :3].T + T[:3, 3]
     expected = corners[:, 0].min()
-    assert float(space.margins(q[None]).box_m[0]) <= expected + 1e-9
+    assert float(space.compute_margins(q[None]).box_m[0]) <= expected + 1e-9
 
 
 @given(st.lists(st.floats(-1.0, 1.0), min_size=12, max_size=12))
@@ -63,38 +63,38 @@ def testsegment_distance_is_the_least_over_both(numbers: list[float]) -> None:
 
 def test_home_and_the_folded_pose_are_allowed(guard: Guard) -> None:
     for q in (HOME, FOLDED):
-        assert guard.refusal(q[None], q) is None
-        assert min(float(m[0]) for m in guard.margins(q[None])) > 0.0
+        assert guard.find_violation(q[None], q) is None
+        assert min(float(m[0]) for m in guard.compute_margins(q[None])) > 0.0
 
 
 def test_a_posture_below_the_table_is_refused_with_the_depth(guard: Guard) -> None:
-    index, what = guard.refusal(np.array([HOME, LOW]), HOME) or (-1, "")
+    index, what = guard.find_violation(np.array([HOME, LOW]), HOME) or (-1, "")
     assert index == 1
     assert "below the table" in what
-    depth_mm = -1e3 * float(guard.margins(LOW[None]).table_m[0])
+    depth_mm = -1e3 * float(guard.compute_margins(LOW[None]).table_m[0])
     assert f"{depth_mm:.0f} mm" in what
 
 
 def test_a_posture_that_runs_into_the_arm_itself_is_refused(guard: Guard) -> None:
     q = np.append([0.0, 1.44, -0.06, 1.4, 0.6, 0.23], -1.0)
-    assert "too near to each other" in (guard.refusal(q[None], HOME) or (0, ""))[1]
+    assert "too near to each other" in (guard.find_violation(q[None], HOME) or (0, ""))[1]
 
 
 def test_a_hand_outside_the_box_is_refused() -> None:
     small = Guard(Workspace(lower_m=(0.2, -0.3, 0.0), upper_m=(0.7, 0.3, 0.6)))
     aside = HOME.copy()
     aside[0] = 1.2
-    assert small.refusal(HOME[None], HOME) is None
-    assert "workspace box" in (small.refusal(aside[None], HOME) or (0, ""))[1]
+    assert small.find_violation(HOME[None], HOME) is None
+    assert "workspace box" in (small.find_violation(aside[None], HOME) or (0, ""))[1]
 
 
 def test_an_arm_that_is_outside_already_may_come_back_but_not_go_further(guard: Guard) -> None:
     up, down = LOW.copy(), LOW.copy()
     up[1] -= 0.05
     down[1] += 0.05
-    assert guard.refusal(up[None], LOW) is None
-    assert guard.refusal(LOW[None], LOW) is None
-    assert guard.refusal(down[None], LOW) is not None
+    assert guard.find_violation(up[None], LOW) is None
+    assert guard.find_violation(LOW[None], LOW) is None
+    assert guard.find_violation(down[None], LOW) is not None
 
 
 @pytest.mark.parametrize(("lower", "upper"), [((1.0, 0, 0), (0.0, 1, 1)), ((0, 0, np.nan), (1, 1, 1))])
@@ -136,7 +136,7 @@ def test_a_later_chunk_through_the_table_is_refused_and_the_arm_brakes_before_it
     assert bench.mode is ServoMode.HOLDING
     assert "below the table's plane" in bench.reason
     # It brakes on the part of the way that was allowed, which ends before the table.
-    assert guard.margins(bench.commanded()).table_m.min() > 0.0
+    assert guard.compute_margins(bench.commanded()).table_m.min() > 0.0
     assert off_the_way(bench.commanded(), whole) < 1e-5
 
 
@@ -160,7 +160,7 @@ def test_the_way_to_a_setpoint_is_braked_before_it_leads_outside() -> None:
     left[0], right[0] = -0.3, 0.3
     front_m = 0.9
     wide = Guard(Workspace(upper_m=(front_m, 0.9, 1.2)))
-    side, middle = (float(wide.margins(q[None]).box_m[0]) for q in (left, START))
+    side, middle = (float(wide.compute_margins(q[None]).box_m[0]) for q in (left, START))
     assert middle < side
     fence = Guard(Workspace(upper_m=(front_m - (side + middle) / 2, 0.9, 1.2)))
     bench = Bench(start=left, guard=fence)
@@ -170,4 +170,4 @@ def test_the_way_to_a_setpoint_is_braked_before_it_leads_outside() -> None:
         bench.run(0.05, lambda: reasons.add(bench.reason))
     assert any("the way to the setpoint takes the hand" in reason for reason in reasons)
     assert bench.commanded()[-1][0] < 0.0
-    assert fence.margins(bench.commanded()).box_m.min() > -3e-3  # 1 mm of slack, and what the jerk takes
+    assert fence.compute_margins(bench.commanded()).box_m.min() > -3e-3  # 1 mm of slack, and what the jerk takes

@@ -7,7 +7,14 @@ import pytest
 
 from hal.base.errors import InvalidMessageError
 from hal.base.z1 import CONTROL_PERIOD_S, DQ_MAX, KP, N_ARM, N_JOINTS, Q_MAX, Q_MIN
-from hal.servo.limits import ClippedSetpoint, OverloadDetector, ServoLimits, clip_setpoint, find_blocked, compute_servo_torque
+from hal.servo.limits import (
+    ClippedSetpoint,
+    OverloadDetector,
+    ServoLimits,
+    clip_setpoint,
+    compute_servo_torque,
+    find_blocked,
+)
 
 LIMITS = ServoLimits()
 MIDDLE = (Q_MIN + Q_MAX) / 2

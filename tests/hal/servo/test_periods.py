@@ -17,7 +17,7 @@ def test_periods_are_summed_up_only_while_they_are_measured() -> None:
 
 def test_median_and_tail_are_those_of_the_last_periods_in_the_ring() -> None:
     periods = PeriodStatistics(capacity=100)
-    periods.measure(True)
+    periods.set_measuring(True)
     now_s = 0.0
     for step_s in [0.5] * 100 + [0.002] * 100:
         periods.record(now_s)
@@ -35,7 +35,7 @@ def test_a_cycle_more_than_half_a_period_late_is_an_overrun() -> None:
 
 def test_a_summary_is_kept_for_a_while() -> None:
     periods = PeriodStatistics()
-    periods.measure(True)
+    periods.set_measuring(True)
     for i in range(10):
         periods.record(0.002 * i)
     first = periods.summary()
@@ -50,9 +50,9 @@ def test_a_summary_is_kept_for_a_while() -> None:
 def test_the_time_between_two_threads_that_tick_is_no_period() -> None:
     periods = PeriodStatistics()
     for start_s in (0.0, 7.0):
-        periods.measure(True)
+        periods.set_measuring(True)
         for i in range(10):
             periods.record(start_s + 0.002 * i)
-        periods.measure(False)
+        periods.set_measuring(False)
     assert periods.overruns == 0
     assert periods.summary() == pytest.approx((500.0, 2.0, 2.0, 2.0, 2.0))
