@@ -98,7 +98,7 @@ def main(config: Config) -> int:
             workspace=config.workspace,
             cpu=config.cpu,
             force_exit_event=force_exit_event,
-            readonly=config.readonly,
+            monitor_only=config.readonly,
         )
     return 0
 
