@@ -1,4 +1,4 @@
-"""Parking: slow folding of the arm before its motors are disabled, at the end of a HAL process whose rig asks for it."""
+"""Parking: slow folding of the arm before its motors are disabled, at the end of a HAL process that asks for it."""
 
 from __future__ import annotations
 

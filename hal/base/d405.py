@@ -28,7 +28,7 @@ EXPOSURE_US = (1, 165_000, 33_000)
 GAIN = (16, 248, 16)
 """Minimum, maximum, default."""
 ASIC_C = 35.0
-"""Temperature that a twin reports [°C]; real units are specified up to 35 °C ambient, and fail from about 42 °C."""
+"""Temperature of a twin [°C]; real units are specified up to 35 °C ambient, and are unreliable from about 42 °C."""
 RESET_S = 2.0
 """Approximate time off the bus after a hardware reset [s]."""
 
@@ -166,7 +166,7 @@ class FrameSource(Protocol):
         """False while the cable is out."""
         ...
 
-    def expose(self, look: CaptureRequest) -> Exposure | None:
+    def expose(self, request: CaptureRequest, /) -> Exposure | None:
         """Return the images of this moment; None = the camera hangs and delivers nothing."""
         ...
 
