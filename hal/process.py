@@ -96,9 +96,8 @@ def serve(
         undo.callback(servo.disconnect)
         undo.callback(shutdown.disable_motors)
         undo.callback(rig.camera.disconnect)
-        servo.set_safety_guard(
-            Guard(workspace)
-        )  # after connecting: it takes a second to load, a missing arm fails first
+        # After connecting: the guard takes a second to load, which a missing arm need not wait for.
+        servo.set_safety_guard(Guard(workspace))
         ticking.start()
         undo.callback(ticking.stop)
         _await_first_tick(servo, ticking)

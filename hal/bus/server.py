@@ -263,18 +263,18 @@ def _decode_reason(reason: bytes) -> str:
 class _StateChangeWarning:
     """A warning logged when a failure begins and when it is over, not at every cycle in between."""
 
-    def __init__(self, what: str) -> None:
-        self._what = what
+    def __init__(self, failure: str) -> None:
+        self._failure = failure
         self._kind: tuple[type[HalError], str] | None = None
 
     def warn(self, error: HalError) -> None:
         """Log `error`, unless the last one was of the same class and code (texts hold stamps and ages)."""
         if self._kind != (kind := (type(error), error.code)):
             self._kind = kind
-            _LOG.warning("%s: %s", self._what, error)
+            _LOG.warning("%s: %s", self._failure, error)
 
     def clear(self) -> None:
         """Log the end of the failure, if there was one."""
         if self._kind is not None:
             self._kind = None
-            _LOG.info("over: %s", self._what)
+            _LOG.info("over: %s", self._failure)

@@ -126,7 +126,7 @@ def find_blocked(limits: ServoLimits, q_command: np.ndarray, q_measured: np.ndar
     worst = int(error.argmax())
     return (
         f"{z1.JOINT_NAMES[worst]} is {error[worst]:.2f} rad from its command (allowed "
-        f"{limits.following_error_rad:.2f}): it is blocked or has hit something"
+        f"{limits.following_error_rad:.2f}): it is blocked or in collision"
     )
 
 

@@ -22,7 +22,7 @@ from hal.servo.limits import ServoLimits, clip_setpoint
 from hal.servo.periods import PeriodStatistics
 from hal.servo.status import StatusLogger, make_health, make_status
 
-_STATE_MAX_AGE_S = 0.2  # 100 ticks: beyond any scheduling delay, so the ticks or the arm's link have ended
+_STATE_MAX_AGE_S = 0.2  # 100 ticks; `BusConfig.state_max_age_s` is the same for clients
 
 
 class Servo:
@@ -113,7 +113,7 @@ class Servo:
     # --- Commands and queries, from any thread ----------------------------------------------------------------
 
     def read_state(self) -> ArmState:
-        """Return the measurement of the last tick; before the first tick, ask the arm.
+        """Return the measurement of the last tick; before the first tick, of the arm now.
 
         Once a thread ticks, only that thread may access the arm: two would interleave on its link.
 

@@ -15,7 +15,7 @@ from hal.servo.braking import Blend, Brake, JointStop, PathStop, TargetTracker, 
 from hal.servo.limits import ServoLimits
 from hal.servo.trajectory_buffer import TrajectoryBuffer
 
-_AT_REST_RAD_S = 0.02  # a final point faster than this needs a stop; slower is rounding of a planner
+_AT_REST_RAD_S = 0.02  # a trajectory whose last point is faster ends in motion and is braked
 _YIELD_THRESHOLD_RAD = 0.01  # below it the difference to the measurement is the servo's ordinary tracking error
 _ON_PATH_RAD = 1e-6
 _ZERO = np.zeros(N_JOINTS)

@@ -21,7 +21,7 @@ MAX_GAP_S = 0.05
 MAX_POINTS = 10_000
 """Maximum number of buffered points: 20 s at the servo's rate. Checking more would delay a stop."""
 _SAME_TIME_S = 1e-6
-_KEEP_S = 0.1  # played points kept: the tick may still read the buffer a few periods behind the producer
+_KEEP_S = 0.1  # of points before the played time
 _POSITION_TOLERANCE_RAD = 1e-6  # rounding of a point on a joint limit
 _SPEED_TOLERANCE = 1.001  # difference quotients of a motion at full speed exceed it by rounding
 _SMOOTHNESS_TOLERANCE = 1.05  # cubics through samples of a smooth motion overshoot its acceleration a little

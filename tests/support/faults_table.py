@@ -58,10 +58,10 @@ class FaultsTable:
 
 def describe(status: ServoStatus, moved: np.ndarray) -> str:
     """Return the arm's reaction in words, from its `status` and its motion `moved` (7,) [rad] since the fault."""
-    what = {ServoMode.STOPPED: "braked, stopped until re-armed", ServoMode.HOLDING: "braked, holds"}
+    reactions = {ServoMode.STOPPED: "braked, stopped until re-armed", ServoMode.HOLDING: "braked, holds"}
     joint = int(np.abs(moved[:N_ARM]).argmax())
     further = f"{JOINT_NAMES[joint]} moved on by {1e3 * abs(moved[joint]):.0f} mrad"
-    return f"{what.get(status.mode, status.mode.value)}; {further}"
+    return f"{reactions.get(status.mode, status.mode.value)}; {further}"
 
 
 _ROWS = pytest.StashKey[FaultsTable]()
@@ -87,8 +87,8 @@ def _print(rows: list[Row]) -> None:
     """Print the table as wide as the terminal is; into a file or a pipe as Markdown."""
     is_screen = sys.stdout.isatty()
     table = Table(title="Faults injected" if is_screen else None, box=box.ROUNDED if is_screen else box.MARKDOWN)
-    for column, how in (("fault", "left"), ("the arm", "left"), ("noticed", "right"), ("rests", "right")):
-        table.add_column(column, justify=how, overflow="fold")  # pyright: ignore[reportArgumentType]
+    for column, justify in (("fault", "left"), ("the arm", "left"), ("noticed", "right"), ("rests", "right")):
+        table.add_column(column, justify=justify, overflow="fold")  # pyright: ignore[reportArgumentType]
     table.add_column("the operator reads", overflow="fold")
     for row in rows:
         cells = (row.fault, row.arm, _duration(row.noticed_s), _duration(row.rest_s), row.reads)
