@@ -14,7 +14,7 @@ from tests.support.errors import raises
 from tests.support.hal.servo_bench import START, move, setpoint
 
 
-class HandledArm(MockArm):
+class ExternallyMovedArm(MockArm):
     """An arm that another program moves, and that accepts no command."""
 
     def send(self, setpoint: ArmSetpoint) -> ArmSetpoint:
@@ -26,7 +26,7 @@ class HandledArm(MockArm):
 
 def test_it_reports_the_arms_position_and_sends_nothing() -> None:
     clock = ManualClock(5.0)
-    arm = HandledArm(clock, q=START)
+    arm = ExternallyMovedArm(clock, q=START)
     servo = MonitorOnlyServo(arm, clock)
     servo.connect()
     for _ in range(500):
@@ -42,7 +42,7 @@ def test_it_reports_the_arms_position_and_sends_nothing() -> None:
 
 def test_it_rejects_every_claim_command_and_stop() -> None:
     clock = ManualClock(5.0)
-    servo = MonitorOnlyServo(HandledArm(clock, q=START), clock)
+    servo = MonitorOnlyServo(ExternallyMovedArm(clock, q=START), clock)
     servo.connect()
     servo.tick()
     with raises(LeaseError, "monitor_only"):
@@ -56,7 +56,7 @@ def test_it_rejects_every_claim_command_and_stop() -> None:
 
 def test_a_fault_of_the_arm_is_reported() -> None:
     clock = ManualClock(5.0)
-    arm = HandledArm(clock, q=START)
+    arm = ExternallyMovedArm(clock, q=START)
     servo = MonitorOnlyServo(arm, clock)
     servo.connect()
     arm.inject_fault("overheat joint 2")
