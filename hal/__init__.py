@@ -1,1 +1,1 @@
-"""The hardware behind two contracts, `Arm` and `Camera`, and the safety that lives below every producer."""
+"""Hardware layer: two contracts, `Arm` and `Camera`, and the safety functions below every client."""

@@ -1,23 +1,25 @@
-"""Lets `open3d` and `pyrealsense2` be imported on a machine without libusb-1.0."""
+"""Preload of libusb-1.0, by which `open3d` and `pyrealsense2` can be imported on a machine without it."""
 
 from __future__ import annotations
 
 import ctypes
 from functools import cache
 
+from hal.base.errors import SdkMissingError
+
 _SONAME = "libusb-1.0.so.0"
 
 
 @cache
 def preload() -> str:
-    """Load libusb-1.0 for those who link against it without bringing it; return where it came from.
+    """Load libusb-1.0 for wheels that link against it without shipping it; return its path or soname.
 
-    The system's is taken where there is one, since a real camera wants the one its udev rules were made for; else
-    that of the `libusb-package` wheel. Its names have to be global: the wheels that need it look them up by soname
-    in the process. Call it before `import open3d` or `import pyrealsense2`; more calls do nothing.
+    The system's library is preferred, since a real camera's udev rules belong to it; else that of the `libusb-package`
+    wheel. Its symbols have to be global: the wheels look them up by soname in the process. Call it before
+    `import open3d` or `import pyrealsense2`; further calls do nothing.
 
     Raises:
-        ImportError: there is neither.
+        SdkMissingError: there is neither.
     """
     try:
         ctypes.CDLL(_SONAME, mode=ctypes.RTLD_GLOBAL)
@@ -26,9 +28,9 @@ def preload() -> str:
 
         path = libusb_package.get_library_path()
         if path is None:
-            raise ImportError(
-                f"there is no {_SONAME} on this machine ({missing}) and none in the libusb-package wheel; "
-                "run `uv sync` or `apt install libusb-1.0-0`."
+            raise SdkMissingError(
+                f"libusb: {_SONAME} is neither on this machine ({missing}) nor in the libusb-package wheel. "
+                "Run `uv sync` or `apt install libusb-1.0-0`."
             ) from missing
         ctypes.CDLL(str(path), mode=ctypes.RTLD_GLOBAL)
         return str(path)

@@ -1,4 +1,4 @@
-"""Folding the arm, slowly, before its motors go soft: what a HAL process does last when its rig asks for it."""
+"""Parking: slow folding of the arm before its motors are disabled, at the end of a HAL process that asks for it."""
 
 from __future__ import annotations
 
@@ -16,53 +16,53 @@ from hal.servo.limits import ServoLimits
 from hal.servo.servo import Servo
 
 _LOG = logging.getLogger(__name__)
-_OWNER = "the HAL's ending"
-_LOOK_S = 0.02
-_BRAKING_S = 2.0
-_TELL_S = 2.0
+_OWNER = "HAL parking"
+_POLL_S = 0.02
+_MAX_BRAKING_S = 2.0
+_PROGRESS_PERIOD_S = 2.0
 _SPACING_S = 0.02
-_SHORTEST_S = 0.5
-_SQUEEZES_NM = 1.0
+_MIN_DURATION_S = 0.5
+_GRIP_TORQUE_NM = 1.0  # a third of `ServoLimits.grip_torque_nm`, with which an object is held
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Parking:
-    """Where and how an arm is parked."""
+    """Pose and speed of parking an arm."""
 
     q: np.ndarray
-    """(6,) the folded pose [rad], in which it lies without its motors."""
+    """(6,) folded pose [rad], in which the arm rests without its motors."""
     speed_rad_s: float = 0.3
-    """No joint is faster on the way there [rad/s]."""
-    soften: Callable[[], None] | None = None
-    """Lets the motors go, once it lies there and nothing ticks any more; None = they hold."""
+    """Maximum joint speed [rad/s]."""
+    disable_motors: Callable[[], None] | None = None
+    """Disables the motors, after the last tick of a parked arm; None = they hold."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "q", frozen_array(self.q, float, (z1.N_ARM,), "Parking.q"))
 
 
-def park(servo: Servo, parking: Parking, give_up: Event) -> bool:
-    """Take the arm from whoever commands it, brake it, fold it, and say how it goes; whether it lies there now.
+def park(servo: Servo, parking: Parking, abort: Event) -> bool:
+    """Take over the arm, brake it and fold it, with log lines of the progress; return True when it is parked.
 
-    The way is straight in joint space, or by way of home when the guard forbids that. A stop, a fault or `give_up`
-    ends it, and the arm brakes and holds; a stop that was latched before is left alone.
+    The path is straight in joint space, or by way of home where the guard forbids that. A stop, a fault or `abort` ends
+    it, and the arm brakes and holds; a stop that was latched before stays latched.
 
     Args:
         servo: ticked by another thread.
-        parking: where to.
-        give_up: set when somebody does not want to wait for it.
+        parking: pose and speed.
+        abort: set by the operator to end the parking.
     """
     try:
         _take_over(servo)
-        if abs(servo.read_state().tau[z1.N_ARM]) > _SQUEEZES_NM:
-            raise CommandRejectedError("the gripper holds something.")
+        if abs(servo.read_state().tau[z1.N_ARM]) > _GRIP_TORQUE_NM:
+            raise CommandRejectedError("the gripper holds an object.", code="gripper_loaded")
         try:
-            _drive(servo, parking.q, parking.speed_rad_s, give_up)
+            _move_to(servo, parking.q, parking.speed_rad_s, abort)
         except GuardError as error:
             _LOG.info("parking by way of home: %s", error)
             for station in (z1.Q_HOME, parking.q):
-                _drive(servo, station, parking.speed_rad_s, give_up)
+                _move_to(servo, station, parking.speed_rad_s, abort)
     except HalError as error:
-        _LOG.warning("not parked: %s The arm holds where it is: support it before you switch it off.", error)
+        _LOG.warning("not parked: %s The arm holds its position: support it before you switch it off.", error)
         return False
     _LOG.info("parked")
     return True
@@ -72,46 +72,50 @@ def _take_over(servo: Servo) -> None:
     servo.release()
     servo.claim(_OWNER)
     pause, waited_s = Event(), 0.0
-    while servo.status().mode in (ServoMode.TRACKING, ServoMode.BRAKING) and waited_s < _BRAKING_S:
-        pause.wait(_LOOK_S)
-        waited_s += _LOOK_S
+    while servo.status().mode in (ServoMode.TRACKING, ServoMode.BRAKING) and waited_s < _MAX_BRAKING_S:
+        pause.wait(_POLL_S)
+        waited_s += _POLL_S
         servo.heartbeat(_OWNER)
 
 
-def _drive(servo: Servo, station: np.ndarray, speed_rad_s: float, give_up: Event) -> None:
+def _move_to(servo: Servo, station: np.ndarray, speed_rad_s: float, abort: Event) -> None:
     """Move the arm to `station` (6,) [rad] and wait for it.
 
     Raises:
-        GuardError: the way is not allowed; nothing has moved.
-        StoppedError: a stop or a fault came in between.
-        HalError: it was given up.
+        GuardError: the path violates the guard; nothing has moved.
+        StoppedError: a stop or a fault ended the motion.
+        HalError: the operator aborted it (`aborted`).
     """
     status = servo.status()
     goal = np.append(station, status.q_command[z1.N_ARM])
-    motion = _quintic(status.trajectory_id + 1, status.q_command, goal, speed_rad_s, servo.limits)
+    motion = _plan_quintic(status.trajectory_id + 1, status.q_command, goal, speed_rad_s, servo.limits)
     servo.stream(motion)
-    duration_s, told_s = float(motion.t_s[-1]), -_TELL_S
+    duration_s, logged_s = float(motion.t_s[-1]), -_PROGRESS_PERIOD_S
     while (status := servo.status()).trajectory_id != motion.trajectory_id or not status.finished:
         dropped = status.trajectory_id == motion.trajectory_id and status.mode is not ServoMode.TRACKING
         if dropped or status.mode is ServoMode.STOPPED:
             raise StoppedError(status.reason)
-        if give_up.wait(_LOOK_S):
-            raise HalError("somebody did not want to wait for it.")
+        if abort.wait(_POLL_S):
+            raise HalError("parking aborted by the operator.", code="aborted")
         servo.heartbeat(_OWNER)
-        if status.trajectory_time_s - told_s >= _TELL_S:
-            told_s = status.trajectory_time_s
-            _LOG.info("parking: %.0f of %.0f s (Ctrl-C again, or `./z1 stop`, ends it)", told_s, duration_s)
+        if status.trajectory_time_s - logged_s >= _PROGRESS_PERIOD_S:
+            logged_s = status.trajectory_time_s
+            _LOG.info("parking: %.0f of %.0f s (Ctrl-C again, or `./z1 stop`, ends it)", logged_s, duration_s)
 
 
-def _quintic(
+def _plan_quintic(
     trajectory_id: int, start: np.ndarray, goal: np.ndarray, speed_rad_s: float, limits: ServoLimits
 ) -> TrajectoryChunk:
     """Return the motion from rest at `start` (7,) to rest at `goal` (7,) [rad] at that speed, or slower for a limit."""
     step = goal - start
-    far = np.abs(step)
-    # The peaks of a quintic from rest to rest over its duration T: 15/8 d/T, 5.78 d/T², 60 d/T³.
-    times_s = (1.875 * far / speed_rad_s, np.sqrt(5.78 * far / limits.ddq_max), np.cbrt(60.0 * far / limits.dddq_max))
-    duration_s = max(float(np.max(times_s)), _SHORTEST_S)
+    distance = np.abs(step)
+    # Peaks of a quintic from rest to rest over its duration T: speed 15/8 d/T, acceleration 5.78 d/T², jerk 60 d/T³.
+    times_s = (
+        1.875 * distance / speed_rad_s,
+        np.sqrt(5.78 * distance / limits.ddq_max),
+        np.cbrt(60.0 * distance / limits.dddq_max),
+    )
+    duration_s = max(float(np.max(times_s)), _MIN_DURATION_S)
     u = np.linspace(0.0, 1.0, round(duration_s / _SPACING_S) + 1)
     return TrajectoryChunk(
         trajectory_id=trajectory_id,

@@ -1,4 +1,4 @@
-"""Backends by name: lazy `"module:attribute"` strings, so that listing them imports no SDK and no simulator."""
+"""Registry of backends: lazy `"module:attribute"` strings, so that listing them imports no SDK and no simulator."""
 
 from __future__ import annotations
 
@@ -24,10 +24,14 @@ class Registry(Generic[T]):
         """Add `name` as `"module:attribute"`.
 
         Raises:
-            ValueError: the name is taken.
+            InvalidValueError: the name is taken (`name_taken`).
         """
         if name in self._entries:
-            raise InvalidValueError(f"{self._kind} backend {name!r} is registered already, as {self._entries[name]}.")
+            raise InvalidValueError(
+                f"registry: {self._kind} backend {name!r} is registered already, as {self._entries[name]}. Choose "
+                f"another name.",
+                code="name_taken",
+            )
         self._entries[name] = target
 
     def names(self) -> list[str]:
@@ -38,7 +42,7 @@ class Registry(Generic[T]):
         """Import the backend and call it with `options`.
 
         Raises:
-            UnknownBackendError: no such name; the message lists the known ones.
+            UnknownBackendError: no backend has that name; the message lists the known ones.
         """
         if name not in self._entries:
             raise UnknownBackendError(self._kind, name, self._entries)

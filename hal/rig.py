@@ -1,4 +1,4 @@
-"""A rig is what one robot is made of: an arm, a camera, and the clock they live by."""
+"""Rig: one set of connected devices, an arm, a camera, and their clock."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ class Rig:
     camera: Camera
     clock: Clock
     call_every_tick: Callable[[Callable[[], None]], None] | None = None
-    """In lock-step: registers what the clock calls every control period while somebody sleeps on it. None when the
-    clock is the wall's, where `hal.servo.servo_thread.ServoThread` does the calling."""
+    """In lock-step: registers a callback that the clock calls every control period while a thread sleeps on it. None on
+    the wall clock, where `hal.servo.servo_thread.ServoThread` ticks."""
     independent: bool = False
-    """Arm and camera are devices of their own, which can be connected at the same time."""
+    """True when arm and camera are separate devices, which can be connected at the same time."""
     park: Parking | None = None
-    """What a HAL process does with the arm when it is told to end; None = the arm holds where it is."""
+    """Parking of the arm at the end of a HAL process; None = the arm holds its position."""
     world: Any = None
     """The simulated world behind the devices, for evaluation only; None on a real robot."""
 

@@ -61,7 +61,7 @@ class GroundTruthServer:
     def __init__(self, config: BusConfig, world: SceneView) -> None:
         self._world = world
         self._session = open_session(config, listen=False)
-        self._service = Service(self._session, _TRUTH, self._answer, on_death=lambda: None)
+        self._service = Service(self._session, _TRUTH, self._answer, on_failure=lambda: None)
         atexit.register(self.close)  # a program that ends carelessly leaves no thread inside Zenoh
 
     def close(self) -> None:

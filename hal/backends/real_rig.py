@@ -32,5 +32,5 @@ def make_rig(*, arm: Z1ArmConfig | None = None, camera: Any = None, **_: Any) ->
         camera=CAMERAS.make("d405", clock=clock, config=camera or D405CameraConfig(search_s=SEARCH_S)),
         clock=clock,
         independent=True,
-        park=Parking(q=LABELS["startFlat"], soften=z1_arm.go_passive),
+        park=Parking(q=LABELS["startFlat"], disable_motors=z1_arm.go_passive),
     )

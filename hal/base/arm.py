@@ -1,4 +1,4 @@
-"""What an arm is to the rest of the system: six joints and the gripper as the seventh."""
+"""Contracts of an arm: six joints, and the gripper as the seventh."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from hal.base.messages import ArmSetpoint, ArmState, ServoStatus, TrajectoryChun
 
 @runtime_checkable
 class Arm(Protocol):
-    """An arm that takes one setpoint a tick. Nothing here is safe by itself: see `hal.servo.servo.Servo`."""
+    """An arm that takes one setpoint a tick. It has no safety functions of its own: see `hal.servo.servo.Servo`."""
 
     def connect(self) -> None:
         """Open the link; the arm holds still. A failed connect leaves nothing open.
 
         Raises:
-            HalTimeoutError: nobody answers.
+            HalTimeoutError: the arm does not answer.
         """
         ...
 
     def disconnect(self) -> None:
-        """Close the link; the arm holds where it is. Harmless when not connected."""
+        """Close the link; the arm holds its position. No effect when not connected."""
         ...
 
     def read_state(self) -> ArmState:
@@ -28,16 +28,16 @@ class Arm(Protocol):
 
         Raises:
             NotConnectedError: before `connect()`.
-            HalTimeoutError: the newest measurement is too old to be trusted.
+            HalTimeoutError: the newest measurement is too old.
         """
         ...
 
     def send(self, setpoint: ArmSetpoint) -> ArmSetpoint:
-        """Hand over the next setpoint; return what was really applied after the backend's limits.
+        """Send the next setpoint; return the one applied after the backend's limits.
 
         Raises:
             NotConnectedError: before `connect()`.
-            CommandRejectedError: the arm will not take it.
+            CommandRejectedError: the arm does not accept it.
         """
         ...
 
@@ -48,37 +48,38 @@ class Arm(Protocol):
 
 @runtime_checkable
 class ServoedArm(Arm, Protocol):
-    """An arm with the servo above it: takes trajectories, owns the lease, latches the stop.
+    """An arm with the servo above it: plays trajectories, grants the lease, latches the stop.
 
-    `hal.servo.servo.Servo` is one in this process, `hal.bus.client.RemoteArm` is the same one over Zenoh.
+    `hal.servo.servo.Servo` is one in this process; `hal.bus.client.RemoteArm` is one in the HAL process, over Zenoh.
     """
 
     def claim(self, owner: str) -> None:
-        """Take the command lease.
+        """Claim the command lease.
 
         Raises:
-            LeaseError: somebody else holds it; the message names the holder.
+            LeaseError: another client owns it; the message names the owner.
         """
         ...
 
     def release(self) -> None:
-        """Give the lease back; a running motion is braked first. Harmless when not held."""
+        """Release the lease and brake a running motion. No effect when not owned."""
         ...
 
     def stream(self, chunk: TrajectoryChunk) -> None:
-        """Queue a piece of a trajectory.
+        """Queue a trajectory chunk.
 
         Raises:
             StoppedError: the stop is latched.
-            LeaseError: the lease is not ours.
+            LeaseError: the caller does not own the lease.
+            GuardError: it leaves the workspace.
             CommandRejectedError: it starts too far from the arm, breaks a limit, or leaves a gap in time.
         """
         ...
 
     def status(self) -> ServoStatus:
-        """Return the servo's newest account of itself."""
+        """Return the servo's present status."""
         ...
 
     def rearm(self) -> None:
-        """Lift a latched stop; the arm holds where it is and the lease is free."""
+        """Clear a latched stop; the arm holds its position and the lease is free."""
         ...

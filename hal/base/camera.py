@@ -1,4 +1,4 @@
-"""What a depth camera is to the rest of the system."""
+"""Contract of a depth camera."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from hal.base.messages import Intrinsics, RgbdFrame
 
 @runtime_checkable
 class Camera(Protocol):
-    """Colour and depth of one instant, in one message."""
+    """A camera of colour and depth, both of one instant, in one message."""
 
     def connect(self) -> None:
-        """Open the device and wait until it delivers. A failed connect leaves nothing open.
+        """Open the device and wait for its first frame. A failed connect leaves nothing open.
 
         Raises:
             HalTimeoutError: no frame arrives.
@@ -20,12 +20,12 @@ class Camera(Protocol):
         ...
 
     def disconnect(self) -> None:
-        """Close the device. Harmless when not connected."""
+        """Close the device. No effect when not connected."""
         ...
 
     @property
     def intrinsics(self) -> Intrinsics:
-        """Of both images of every frame.
+        """Pinhole of both images of every frame.
 
         Raises:
             NotConnectedError: before `connect()`.
@@ -37,6 +37,6 @@ class Camera(Protocol):
 
         Raises:
             NotConnectedError: before `connect()`.
-            HalTimeoutError: none came within `timeout_s` [s].
+            HalTimeoutError: no frame arrived within `timeout_s` [s].
         """
         ...

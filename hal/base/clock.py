@@ -1,6 +1,6 @@
-"""The one place that reads the time or sleeps; everyone else is handed a `Clock`.
+"""Clocks: the only place that reads the time or sleeps; all other code gets a `Clock`.
 
-On the robot that clock is the wall's, in a test it is moved by hand, and in lock-step it is the twin's
+On the robot it is the wall clock, in a test it is advanced by hand, and in lock-step it is the twin's
 (`sim_twin.clock.TwinClock`), so that a whole episode is a pure function of its seed.
 """
 
@@ -9,14 +9,14 @@ from __future__ import annotations
 import time
 from typing import Protocol
 
-_OTHERS_BEGAN_S = 1.6e9  # long after 1970: librealsense takes small stamps for nonsense and no longer pairs frames
+_SIMULATED_EPOCH_S = 1.6e9  # long after 1970: librealsense treats small stamps as invalid and no longer pairs frames
 
 
 class Clock(Protocol):
     """Monotonic time in seconds."""
 
     def now_s(self) -> float:
-        """Return the present time [s]; never goes back."""
+        """Return the present time [s]; it never decreases."""
         ...
 
     def sleep_until(self, t_s: float) -> None:
@@ -25,7 +25,7 @@ class Clock(Protocol):
 
 
 class WallClock:
-    """CLOCK_MONOTONIC; the same for all processes of one machine."""
+    """The machine's CLOCK_MONOTONIC, the same for all its processes."""
 
     def now_s(self) -> float:
         return time.monotonic()
@@ -37,16 +37,16 @@ class WallClock:
 
 
 def unix_offset_s(clock: Clock) -> float:
-    """Return what to add to a time of `clock` to get Unix time [s].
+    """Return the offset to add to a time of `clock` to get Unix time [s].
 
-    Only for devices that stamp their data with the system's time, which may jump: ask each time. Clocks other than the
-    wall's begin at one fixed moment.
+    Only for devices that stamp their data with the system's time, which may jump: call it for each conversion. Clocks
+    other than the wall's start at one fixed time.
     """
-    return time.time() - time.monotonic() if isinstance(clock, WallClock) else _OTHERS_BEGAN_S
+    return time.time() - time.monotonic() if isinstance(clock, WallClock) else _SIMULATED_EPOCH_S
 
 
 class ManualClock:
-    """A clock for tests: it moves only when told, or when somebody sleeps on it."""
+    """A clock for tests: it advances only by `advance`, or when a thread sleeps on it."""
 
     def __init__(self, start_s: float = 0.0) -> None:
         self._now_s = start_s
@@ -58,12 +58,12 @@ class ManualClock:
         self._now_s = max(self._now_s, t_s)
 
     def advance(self, dt_s: float) -> None:
-        """Move on by `dt_s` [s]."""
+        """Advance by `dt_s` [s]."""
         self._now_s += dt_s
 
 
 class Stopwatch:
-    """How long something took, in real milliseconds, for reports only; nothing may be decided by it."""
+    """A timer of real durations, for reports only; no decision may depend on it."""
 
     def __init__(self) -> None:
         self._start = time.perf_counter()

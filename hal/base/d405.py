@@ -1,4 +1,4 @@
-"""The RealSense D405: its facts with their source, and the contract of whatever stands in for its optics.
+"""The RealSense D405: its facts with their sources, and the contract of a simulated or recorded source of its frames.
 
 Sources: the D400 datasheet (DigiKey 50822), librealsense's d400 sources, and what real units reported in
 librealsense's issue tracker (#11044, #11219, #12918) and in realsense-ros #3289.
@@ -19,18 +19,18 @@ USB_VENDOR, USB_PRODUCT = "8086", "0B5B"
 PRODUCT_LINE = "D400"
 FIRMWARE = "5.15.1.55"
 SENSOR = "Stereo Module"
-"""The only sensor; colour, depth and infrared all come from it, and there is no "RGB Camera"."""
+"""Name of the only sensor; colour, depth and infrared all come from it, and there is no "RGB Camera"."""
 DEPTH_UNIT_M = 1e-4
-"""What a fresh unit reports; drivers read it from the device, never from here."""
+"""Depth unit of a new device [m]; drivers read it from the device, never from here."""
 BASELINE_M = 0.018
 EXPOSURE_US = (1, 165_000, 33_000)
-"""Lowest, highest, default."""
+"""Minimum, maximum, default [µs]."""
 GAIN = (16, 248, 16)
-"""Lowest, highest, default."""
+"""Minimum, maximum, default."""
 ASIC_C = 35.0
-"""A twin's; real ones are specified up to this around them, and make trouble from about 42 [°C]."""
+"""Temperature of a twin [°C]; real units are specified up to 35 °C ambient, and are unreliable from about 42 °C."""
 RESET_S = 2.0
-"""About so long a hardware reset takes it off the bus."""
+"""Approximate time off the bus after a hardware reset [s]."""
 
 MIN_Z_M = {
     (848, 480): 0.070,
@@ -40,25 +40,25 @@ MIN_Z_M = {
     (480, 270): 0.045,
     (424, 240): 0.040,
 }
-"""Nearest distance with a match, for every resolution (width, height) [px], the default first (datasheet; at 640×480:
-seen to break up below 70 mm)."""
+"""Minimum distance with a stereo match for every resolution (width, height) [px], the default first (datasheet; at
+640×480 depth was observed to break up below 70 mm)."""
 
 
 def rates_hz(width: int, height: int) -> tuple[int, ...]:
-    """Return the frame rates over USB 3 at that resolution, the default first."""
+    """Return the frame rates [Hz] over USB 3 at that resolution, the default first."""
     return (30, 15, 5) if (width, height) == (1280, 720) else (30, 15, 60, 90, 5)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class D405Calibration:
-    """One unit's optics, as figures of its full sensor, 1280 pixels wide; other resolutions scale and crop it."""
+    """Optics of one unit at its full sensor width of 1280 pixels; other resolutions scale and crop it."""
 
     depth_focal_px: float = 641.52
-    """Of both rectified imagers (realsense-ros user data, 425.008 at 848×480)."""
+    """Focal length of both rectified imagers [px] (realsense-ros user data, 425.008 at 848×480)."""
     depth_centre_px: tuple[float, float] = (646.99, 362.58)
     """Principal point of the same at 1280×720."""
     colour_focal_px: tuple[float, float] = (653.35, 652.77)
-    """Of the unrectified left imager (393.0305 and 392.6793 at 640×480)."""
+    """Focal lengths of the unrectified left imager [px] (393.0305 and 392.6793 at 640×480)."""
     colour_centre_px: tuple[float, float] = (628.23, 361.56)
     """Principal point of the same at 1280×720."""
     colour_coeffs: tuple[float, float, float, float, float] = (-0.050604, 0.056276, 0.000795, 0.000941, -0.018168)
@@ -106,30 +106,30 @@ def _scaled(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CaptureRequest:
-    """What is wanted of one exposure."""
+    """Images requested of one exposure."""
 
     number: int
-    """Of the frame; counts up while streaming."""
+    """Number of the frame, which increases while streaming."""
     width: int
-    """Of every image [px]."""
+    """Width of every image [px]."""
     height: int
-    """Of every image [px]."""
+    """Height of every image [px]."""
     depth: bool = False
     colour: bool = False
     left: bool = False
-    """The left imager's rectified picture."""
+    """Rectified image of the left imager."""
     right: bool = False
-    """The right imager's."""
+    """Rectified image of the right imager."""
     brightness: float = 1.0
-    """Of all pictures, relative to what auto-exposure would give: exposure time × gain."""
+    """Exposure time × gain, relative to auto-exposure's."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Exposure:
-    """What the optics saw at one instant; an image that is None is not delivered."""
+    """Images of one instant; None where not delivered."""
 
     number: int
-    """That of the `CaptureRequest`; a source that hangs repeats the last."""
+    """Number of the `CaptureRequest`; a source that hangs repeats the last one."""
     stamp_s: float
     """Mid-exposure, by the source's clock [s]."""
     depth: np.ndarray | None = None
@@ -143,21 +143,22 @@ class Exposure:
 
 
 class FrameSource(Protocol):
-    """The optics of a D405 that is not there, for `hal.compat.realsense.plug`. Only one thread at a time calls it."""
+    """The source of frames of a D405 that is not connected, for `hal.compat.realsense.plug`; used by one thread at a
+    time."""
 
     @property
     def clock(self) -> Clock:
-        """Whose time stamps the frames."""
+        """Clock of the frames' time stamps."""
         ...
 
     @property
     def lockstep(self) -> bool:
-        """True: an exposure is made when somebody waits for it; False: by a thread, at the stream's rate."""
+        """True: an exposure is made when a thread waits for it; False: by a thread, at the stream's rate."""
         ...
 
     @property
     def calibration(self) -> D405Calibration:
-        """Of the optics."""
+        """Calibration of the optics."""
         ...
 
     @property
@@ -165,14 +166,14 @@ class FrameSource(Protocol):
         """False while the cable is out."""
         ...
 
-    def expose(self, look: CaptureRequest) -> Exposure | None:
-        """Return what is seen now; None = the camera hangs and delivers nothing."""
+    def expose(self, request: CaptureRequest, /) -> Exposure | None:
+        """Return the images of this moment; None = the camera hangs and delivers nothing."""
         ...
 
     def reset(self) -> None:
-        """The hardware was reset; whatever hung is well again."""
+        """Reset the hardware, which ends a hang."""
         ...
 
     def close(self) -> None:
-        """Nobody looks for now: free what the next `expose` can open again."""
+        """Free the resources that the next `expose` opens again."""
         ...

@@ -1,4 +1,4 @@
-"""Every error of the project, rooted at `Z1Error`: the message is for the operator, `code` for programs and tests.
+"""Errors of the project, rooted at `Z1Error`: the message is for the operator, `code` for programs and tests.
 
 A message reads `<component>: <what failed> (<value>, allowed <range>). <What to do next>.` Packages derive their own
 errors from the classes here; a second, builtin parent lets callers catch what they would expect.
@@ -15,7 +15,7 @@ class Z1Error(Exception):
 
     Args:
         message: for the operator.
-        code: short stable name of what failed; by default the one of the class.
+        code: short stable name of the failure; by default the one of the class.
     """
 
     default_code: ClassVar[str] = "error"
@@ -24,11 +24,11 @@ class Z1Error(Exception):
         super().__init__(message)
         self.code = code or self.default_code
 
-    def __str__(self) -> str:  # a KeyError parent would show the repr of the sentence
+    def __str__(self) -> str:  # a KeyError parent would show the repr of the message
         return str(self.args[0]) if self.args else ""
 
     def __reduce__(self) -> tuple[object, ...]:
-        # Subclasses build their message from parts; a copy in another process has the message already.
+        # Subclasses build their message from parts; a copy in another process starts from the complete message.
         return _rebuild, (type(self), self.args, self.__dict__)
 
 
@@ -40,7 +40,7 @@ def _rebuild(kind: type[Z1Error], args: tuple[object, ...], state: dict[str, obj
 
 
 class UsageError(Z1Error, ValueError):
-    """An option, a file or a configuration of the user's that cannot be used; a command ends with exit code 2."""
+    """An unusable option, file or configuration of the user's; a command ends with exit code 2."""
 
     default_code = "usage"
 
@@ -52,7 +52,7 @@ class InvalidValueError(UsageError):
 
 
 class ConfigError(UsageError):
-    """A configuration file that cannot be used; the message names the key.
+    """An unusable configuration file; the message names the key.
 
     Attributes:
         key: path of the key in the file, such as `planner.lift_m`; empty without one.
@@ -72,7 +72,7 @@ class OutputExistsError(UsageError, FileExistsError):
 
 
 class MissingFileError(Z1Error, FileNotFoundError):
-    """A file that a command needs and another command makes."""
+    """A missing file that another command writes."""
 
     default_code = "missing_file"
 
@@ -89,7 +89,7 @@ class NotConnectedError(HalError, ConnectionError):
     default_code = "not_connected"
 
     def __init__(self, device: str) -> None:
-        super().__init__(f"{device} is not connected: call connect() first, or use it in a `with` block.")
+        super().__init__(f"{device} is not connected. Call connect() first, or use it in a `with` block.")
 
 
 class HalTimeoutError(HalError, TimeoutError):
@@ -104,49 +104,49 @@ class UnknownBackendError(HalError, UsageError, KeyError):
     default_code = "unknown_backend"
 
     def __init__(self, kind: str, name: str, known: Iterable[str]) -> None:
-        super().__init__(f"there is no {kind} backend {name!r}; known: {', '.join(sorted(known))}.")
+        super().__init__(f"registry: unknown {kind} backend {name!r} (known: {', '.join(sorted(known))}).")
 
 
 class InvalidMessageError(HalError, ValueError):
-    """A message whose fields have the wrong shape, type, or values that are not finite."""
+    """A message whose fields have the wrong shape or type, or values that are not finite."""
 
     default_code = "invalid_message"
 
 
 class CommandRejectedError(HalError, RuntimeError):
-    """The servo rejects this command; the arm continues its present motion."""
+    """A command that the servo rejects; the arm continues its present motion."""
 
     default_code = "command_rejected"
 
 
 class StoppedError(CommandRejectedError):
-    """The stop is latched: nothing moves until the operator re-arms."""
+    """A command rejected because the stop is latched: nothing moves until the operator re-arms."""
 
     default_code = "stopped"
 
     def __init__(self, reason: str) -> None:
-        super().__init__(f"the arm is stopped ({reason}); look at it, then re-arm with `./z1 rearm`.")
+        super().__init__(f"servo: the arm is stopped ({reason}). Inspect it, then re-arm it with `./z1 rearm`.")
 
 
 class GuardError(CommandRejectedError):
-    """The command leaves the workspace, goes below the table, or into the arm itself."""
+    """A command that leaves the workspace, goes below the table, or brings the arm into collision with itself."""
 
     default_code = "guard"
 
 
 class LeaseError(CommandRejectedError):
-    """Another process owns the command lease, or this one has lost it."""
+    """A command of a client that does not own the command lease."""
 
     default_code = "lease"
 
 
 class SdkMissingError(HalError, ImportError):
-    """A vendor's library that a backend needs cannot be imported here."""
+    """A missing vendor library that a backend needs."""
 
     default_code = "sdk_missing"
 
 
 class CameraError(HalError, RuntimeError):
-    """The camera delivered something that cannot be used."""
+    """An unusable image or setting of the camera."""
 
     default_code = "camera"

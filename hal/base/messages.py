@@ -1,4 +1,4 @@
-"""Everything that crosses a boundary: frozen, stamped, SI, with arrays nobody can change afterwards.
+"""Messages between processes and packages: frozen, stamped, in SI units, with read-only arrays.
 
 Poses are `T_parent_child` with `p_parent = T_parent_child @ p_child`. Joint vectors are in `hal.base.z1.JOINT_NAMES`
 order, six arm joints and then the gripper. Stamps are seconds of the clock of the process that made the message.
@@ -20,16 +20,20 @@ def frozen_array(value: Any, dtype: Any, shape: tuple[int | None, ...], name: st
     """Return a read-only copy of `value` as an array of `dtype`, checked against `shape` (None = any length).
 
     Raises:
-        InvalidMessageError: wrong shape, or a float that is not finite.
+        InvalidMessageError: wrong shape (`wrong_shape`), or a float that is not finite (`not_finite`).
     """
     array = np.array(value, dtype=dtype)
     wrong = array.ndim != len(shape) or any(
         want is not None and want != have for want, have in zip(shape, array.shape, strict=True)
     )
     if wrong:
-        raise InvalidMessageError(f"{name} has shape {array.shape}; allowed is {shape} (None = any length).")
+        raise InvalidMessageError(
+            f"{name} has shape {array.shape} (allowed {shape}, None = any length).", code="wrong_shape"
+        )
     if array.dtype.kind == "f" and array.size and not np.isfinite(array).all():
-        raise InvalidMessageError(f"{name} holds values that are not finite: {array[~np.isfinite(array)][:3]}.")
+        raise InvalidMessageError(
+            f"{name} has values that are not finite ({array[~np.isfinite(array)][:3]}).", code="not_finite"
+        )
     array.setflags(write=False)
     return array
 
@@ -41,7 +45,9 @@ def _freeze(message: Any, **arrays: tuple[Any, tuple[int | None, ...]]) -> None:
     for field in fields(message):
         value = getattr(message, field.name)
         if isinstance(value, float) and not np.isfinite(value):
-            raise InvalidMessageError(f"{type(message).__name__}.{field.name} is {value}; it must be finite.")
+            raise InvalidMessageError(
+                f"{type(message).__name__}.{field.name} is {value} (allowed finite values).", code="not_finite"
+            )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -98,13 +104,13 @@ class RgbdFrame:
     depth_m: np.ndarray
     """(H, W) float32 distance along the optical axis [m]; 0 = no measurement."""
     intrinsics: Intrinsics
-    """Of both images."""
+    """Pinhole of both images."""
     stamp_s: float
     """Mid-exposure time [s]."""
     sequence: int
-    """Counts up by one a frame; a gap means lost frames."""
+    """Frame number, which increases by one a frame; a gap means lost frames."""
     serial: str = ""
-    """Serial number of the camera, by which its calibration is found; empty where it tells none."""
+    """Serial number of the camera, by which its calibration is found; empty where unknown."""
     ground_truth_mask: np.ndarray | None = None
     """(H, W) bool, the target object's pixels. Only the twin fills it, for evaluation only."""
 
@@ -117,7 +123,7 @@ class RgbdFrame:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ArmState:
-    """What the arm measures."""
+    """Measurement of the arm."""
 
     stamp_s: float
     """Measurement time [s]."""
@@ -128,7 +134,7 @@ class ArmState:
     tau: np.ndarray
     """(7,) joint torques applied by the motors [Nm]."""
     faults: tuple[str, ...] = ()
-    """Faults the arm reports at this moment, in words; empty when healthy."""
+    """Present faults of the arm, as text; empty when healthy."""
 
     def __post_init__(self) -> None:
         _freeze(self, q=(float, (N_JOINTS,)), dq=(float, (N_JOINTS,)), tau=(float, (N_JOINTS,)))
@@ -136,7 +142,7 @@ class ArmState:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ArmSetpoint:
-    """Where the arm shall be at the next tick."""
+    """Command for the next tick."""
 
     q: np.ndarray
     """(7,) joint positions [rad]."""
@@ -149,70 +155,72 @@ class ArmSetpoint:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class TrajectoryChunk:
-    """A piece of a joint trajectory, sent about 0.2 s before it is due.
+    """A section of a joint trajectory, sent about 0.2 s before it is due.
 
-    Trajectory time starts at 0 with the first point of the first chunk; the servo starts that clock when it takes
-    the chunk and holds it when it is late, so sender and servo need no common clock. A chunk of a new trajectory
-    replaces what is left of the old one.
+    Trajectory time starts at 0 with the first point of the first chunk; the servo starts that clock when it accepts
+    the chunk and pauses it when a tick is late, so sender and servo need no common clock. A chunk of a new trajectory
+    replaces the rest of the old one.
     """
 
     trajectory_id: int
-    """Which trajectory this belongs to; a new one is greater than all before it."""
+    """Identifier of the trajectory; a new one is greater than all before it."""
     t_s: np.ndarray
-    """(N,) trajectory times [s], rising; the first continues where the last chunk ended."""
+    """(N,) trajectory times [s], strictly increasing; the first continues where the last chunk ended."""
     q: np.ndarray
     """(N, 7) joint positions [rad]."""
     dq: np.ndarray
     """(N, 7) joint velocities [rad/s]."""
     final: bool = False
-    """True on the last chunk: the servo then holds its last point instead of calling the sender lost."""
+    """True on the last chunk: the servo then holds its last point instead of reporting a buffer underrun."""
 
     def __post_init__(self) -> None:
         n = len(np.atleast_1d(self.t_s))
         _freeze(self, t_s=(float, (n,)), q=(float, (n, N_JOINTS)), dq=(float, (n, N_JOINTS)))
         if n == 0 or (np.diff(self.t_s) <= 0).any():
-            raise InvalidMessageError("TrajectoryChunk.t_s must hold at least one time and rise strictly.")
+            raise InvalidMessageError(
+                f"TrajectoryChunk.t_s has {n} times (allowed one or more, strictly increasing).", code="invalid_times"
+            )
 
 
 class ServoMode(Enum):
-    """What the servo is doing."""
+    """Mode of the servo."""
 
     HOLDING = "holding"
     """Keeps the last commanded position."""
     TRACKING = "tracking"
-    """Follows a trajectory."""
+    """Follows a trajectory or a single setpoint."""
     BRAKING = "braking"
     """Slows down within the limits, then holds."""
     STOPPED = "stopped"
-    """Holds, and takes no command until it is re-armed."""
+    """Holds, and rejects all commands until it is re-armed."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ServoStatus:
-    """The servo's own account of itself, published beside the arm's state."""
+    """Status of the servo, published with each arm state."""
 
     stamp_s: float
-    """When this was written [s]."""
+    """Time of the tick [s]."""
     mode: ServoMode
-    """What it is doing."""
+    """Mode after the tick."""
     reason: str
-    """Why it brakes, is stopped, or dropped the last trajectory; empty when all is well."""
+    """Reason for braking, for the stop, or for dropping the last trajectory; empty when there is none."""
     owner: str
-    """Who holds the command lease; empty when nobody does."""
+    """Owner of the command lease; empty when it is free."""
     trajectory_id: int
-    """The last trajectory taken; 0 before the first."""
+    """Last trajectory begun or dropped; 0 before the first."""
     trajectory_time_s: float
-    """How far that trajectory has been played [s]."""
+    """Time reached on that trajectory [s]."""
     buffered_s: float
-    """How much of it waits to be played [s]."""
+    """Duration of its buffered part that is not played yet [s]."""
     finished: bool
     """True when that trajectory was played to its end (not when it was dropped)."""
     q_command: np.ndarray
-    """(7,) last setpoint sent to the arm, after limits [rad]."""
+    """(7,) last setpoint sent to the arm, after the limits [rad]."""
     ticks: int
-    """Cycles since the start."""
+    """Ticks since the start."""
     overruns: int
-    """Cycles that began more than half a period late."""
+    """Ticks that began more than half a period late."""
     period_ms_p50: float
     """Median of the last measured periods [ms]; 0 while unmeasured (lock-step)."""
     period_ms_p999: float
@@ -224,31 +232,31 @@ class ServoStatus:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ServoHealth:
-    """How well the servo does its work, published once a second; all figures are measured."""
+    """Health of the servo, published once a second; all figures are measured."""
 
     stamp_s: float
-    """When this was written [s]."""
+    """Time of the message [s]."""
     mode: ServoMode
-    """What it is doing."""
+    """Mode of the servo."""
     faults: tuple[str, ...]
-    """Why it is stopped, or else what the arm reports; empty when all is well."""
+    """Reason of the latched stop, or else the arm's faults; empty when there are none."""
     rate_hz: float
-    """Cycles a second, of the last minute; this and the periods are 0 while unmeasured (lock-step)."""
+    """Ticks per second over the last minute; this and the periods are 0 while unmeasured (lock-step)."""
     period_ms_p50: float
     """Median of the last minute's periods [ms]."""
     period_ms_p99: float
-    """99th percentile of the same [ms]."""
+    """99th percentile [ms]."""
     period_ms_p999: float
     """99.9th percentile [ms]."""
     period_ms_max: float
-    """Longest [ms]."""
+    """Maximum [ms]."""
     ticks: int
-    """Cycles since the start."""
+    """Ticks since the start."""
     overruns: int
-    """Cycles that began more than half a period late."""
+    """Ticks that began more than half a period late."""
     owner: str
-    """Who holds the command lease; empty when nobody does."""
+    """Owner of the command lease; empty when it is free."""
     command_age_s: float
-    """Since the owner was last heard, by a command or its heartbeat [s]; 0 while nobody holds the lease."""
+    """Age of the owner's last command or heartbeat [s]; 0 while the lease is free."""
     real_time: tuple[str, ...]
-    """What the machine granted the servo's thread, such as SCHED_FIFO; empty = it shares its core as any other."""
+    """Real-time resources granted to the servo's thread, such as SCHED_FIFO; empty = ordinary scheduling."""

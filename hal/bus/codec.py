@@ -1,8 +1,8 @@
-"""Every message to and from bytes: a msgpack header of the plain fields, then the arrays as they lie in memory.
+"""Codec of the messages: a msgpack header of the plain fields, then the raw bytes of the arrays.
 
 Layout: magic `Z1`, version (1 byte), one zero byte, header length (uint32), header, arrays in field order, all
-little-endian. The header is `[type name, {field: value}]`, with an array's shape in place of its values; what type a
-field has is read from the dataclass, never from the wire, so nothing that arrives can choose what is constructed.
+little-endian. The header is `[type name, {field: value}]`, with an array's shape in place of its values. Field types
+are read from the dataclass, never from the message, so a sender cannot choose which class is constructed.
 """
 
 from __future__ import annotations
@@ -23,9 +23,10 @@ from hal.base.errors import InvalidMessageError
 
 VERSION = 1
 MAX_BYTES = 64 * 2**20
-"""Longest message taken; a 1280×720 RGB-D frame with mask has 7.4 MB."""
+"""Maximum message; a 1280×720 RGB-D frame with mask has 7.4 MB."""
 _MAX_HEADER = 64 * 2**10
 _MAX_TEXT = 2000
+_MAX_SHOWN = 80  # of an invalid value in an error text
 _PREFIX = struct.Struct("<2sBBI")
 _MAGIC = b"Z1"
 _DTYPES = {"colour": np.dtype("|u1"), "depth_m": np.dtype("<f4"), "ground_truth_mask": np.dtype("|b1")}
@@ -34,7 +35,7 @@ _FLOAT = np.dtype("<f8")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Hello:
-    """What a HAL process says of itself."""
+    """Answer of a HAL process to the handshake."""
 
     robot: str
     """Name of the robot."""
@@ -59,35 +60,37 @@ def _is_array(hint: Any) -> bool:
     return hint is np.ndarray or np.ndarray in get_args(hint)
 
 
-def _plain(value: Any, hint: Any, name: str) -> Any:
-    """Return a field as what msgpack can hold."""
+def _to_plain(value: Any, hint: Any, name: str) -> Any:
+    """Return a field as a type of msgpack."""
     if is_dataclass(hint) and isinstance(hint, type):
-        return {key: _plain(getattr(value, key), sub, f"{name}.{key}") for key, sub in _schema(hint)}
+        return {key: _to_plain(getattr(value, key), sub, f"{name}.{key}") for key, sub in _schema(hint)}
     if isinstance(hint, type) and issubclass(hint, Enum):
         return value.value
     if hint in (bool, int, float, str):
         return hint(value)
     if get_args(hint) == (str, ...):
         return list(value)
-    raise TypeError(f"{name} has type {hint}, for which the codec has no rule; add one to hal/bus/codec.py.")
+    raise TypeError(f"codec: {name} has type {hint}, for which there is no rule. Add one to hal/bus/codec.py.")
 
 
-def _split(message: Any) -> tuple[bytes, list[np.ndarray]]:
+def _split_message(message: Any) -> tuple[bytes, list[np.ndarray]]:
     kind = type(message)
     if MESSAGES.get(kind.__name__) is not kind:
-        raise TypeError(f"{kind.__name__} is not a message; known: {', '.join(sorted(MESSAGES))}.")
+        raise TypeError(f"codec: {kind.__name__} is not a message (known: {', '.join(sorted(MESSAGES))}).")
     plain: dict[str, Any] = {}
     arrays: list[np.ndarray] = []
     for name, hint in _schema(kind):
         value = getattr(message, name)
         if not _is_array(hint):
-            plain[name] = _plain(value, hint, f"{kind.__name__}.{name}")
+            plain[name] = _to_plain(value, hint, f"{kind.__name__}.{name}")
         elif value is None:
             plain[name] = None
         else:
             want = _DTYPES.get(name, _FLOAT)
             if value.dtype != want:
-                raise InvalidMessageError(f"{kind.__name__}.{name} is {value.dtype}; the wire carries {want}.")
+                raise InvalidMessageError(
+                    f"codec: {kind.__name__}.{name} has dtype {value.dtype} (allowed {want}).", code="invalid_dtype"
+                )
             plain[name] = list(value.shape)
             arrays.append(np.ascontiguousarray(value))
     header: bytes = msgpack.packb([kind.__name__, plain])  # pyright: ignore[reportAssignmentType] (its stub is wrong)
@@ -99,15 +102,15 @@ def encode(message: Any) -> bytes:
 
     Raises:
         TypeError: not a message, or a field type the codec does not know.
-        InvalidMessageError: an array whose dtype the wire does not carry (object arrays among them).
+        InvalidMessageError: an array of another dtype than the message's (object arrays among them).
     """
-    head, arrays = _split(message)
+    head, arrays = _split_message(message)
     return b"".join([head, *(array.data.cast("B") if array.size else b"" for array in arrays)])
 
 
 def encode_into(message: Any, buffer: bytearray) -> None:
     """Write `message` to `buffer`, whose length is adapted; each array is copied once."""
-    head, arrays = _split(message)
+    head, arrays = _split_message(message)
     total = len(head) + sum(array.nbytes for array in arrays)
     if len(buffer) != total:
         buffer[:] = bytes(total)
@@ -120,95 +123,126 @@ def encode_into(message: Any, buffer: bytearray) -> None:
 
 
 def decode(data: bytes, kind: type | None = None) -> Any:
-    """Return the message in `data`, every field checked.
+    """Return the message in `data`, with every field checked.
 
     Args:
         data: one whole message.
-        kind: the type it must have; None = any known.
+        kind: the expected type; None = any known.
 
     Raises:
-        InvalidMessageError: anything else than one well-formed message of this version.
+        InvalidMessageError: not exactly one well-formed message of this version; the code names the part:
+            `invalid_length`, `invalid_magic`, `other_version`, `invalid_header`, `unknown_type`, `invalid_fields`,
+            `invalid_field`, `invalid_array`.
     """
     name, plain, body = _open_envelope(data)
     if name not in MESSAGES or (kind is not None and name != kind.__name__):
         allowed = kind.__name__ if kind else ", ".join(sorted(MESSAGES))
-        raise InvalidMessageError(f"the payload is a message of type {name[:60]!r}; allowed here: {allowed}.")
+        raise InvalidMessageError(
+            f"codec: the payload is a message of type {name[:60]!r} (allowed here: {allowed}).", code="unknown_type"
+        )
     found = MESSAGES[name]
     schema = _schema(found)
     if set(plain) != {field for field, _ in schema}:
         raise InvalidMessageError(
-            f"{name} came with the fields {sorted(map(str, plain))[:20]}; needed are {[f for f, _ in schema]}."
+            f"codec: {name} has the fields {sorted(map(str, plain))[:20]} (needed {[f for f, _ in schema]}).",
+            code="invalid_fields",
         )
     values: dict[str, Any] = {}
     at = 0
     for field, hint in schema:
         label = f"{name}.{field}"
         if not _is_array(hint):
-            values[field] = _checked(plain[field], hint, label)
+            values[field] = _check_field(plain[field], hint, label)
         elif plain[field] is None and hint is not np.ndarray:
             values[field] = None
         else:
-            values[field], at = _take_array(body, at, plain[field], _DTYPES.get(field, _FLOAT), label)
+            values[field], at = _read_array(body, at, plain[field], _DTYPES.get(field, _FLOAT), label)
     if at != len(body):
-        raise InvalidMessageError(f"{name} has {len(body)} bytes of arrays; its header tells of {at}.")
+        raise InvalidMessageError(
+            f"codec: {name} has {len(body)} bytes of arrays (its header declares {at}).", code="invalid_length"
+        )
     return found(**values)
 
 
 def _open_envelope(data: bytes) -> tuple[str, dict[Any, Any], memoryview]:
     if not _PREFIX.size <= len(data) <= MAX_BYTES:
-        raise InvalidMessageError(f"the payload has {len(data)} bytes; allowed are {_PREFIX.size} to {MAX_BYTES}.")
+        raise InvalidMessageError(
+            f"codec: the payload has {len(data)} bytes (allowed {_PREFIX.size} to {MAX_BYTES}).", code="invalid_length"
+        )
     magic, version, zero, length = _PREFIX.unpack_from(data)
     if magic != _MAGIC or zero:
-        raise InvalidMessageError(f"the payload begins with {bytes(data[:8])!r}; a message begins with {_MAGIC!r}.")
+        raise InvalidMessageError(
+            f"codec: the payload begins with {bytes(data[:8])!r} (needed {_MAGIC!r}).", code="invalid_magic"
+        )
     if version != VERSION:
-        raise InvalidMessageError(f"the payload has format version {version}; this program speaks {VERSION}: update.")
+        raise InvalidMessageError(
+            f"codec: the payload has format version {version} (allowed {VERSION}). Use the same version on both ends.",
+            code="other_version",
+        )
     end = _PREFIX.size + length
     if length > _MAX_HEADER or end > len(data):
-        raise InvalidMessageError(f"the payload claims a header of {length} bytes but has {len(data)} in all.")
+        raise InvalidMessageError(
+            f"codec: the payload declares a header of {length} bytes but has {len(data)} in all.", code="invalid_header"
+        )
     try:
         header = msgpack.unpackb(data[_PREFIX.size : end])
     except (ValueError, OverflowError, msgpack.UnpackException) as err:
-        raise InvalidMessageError(f"the payload's header is not msgpack: {err}.") from err
+        raise InvalidMessageError(
+            f"codec: the payload's header is not msgpack ({err}).", code="invalid_header"
+        ) from err
     match header:
         case [str(name), dict(plain)]:
             return name, plain, memoryview(data)[end:]
-    raise InvalidMessageError(f"the payload's header is {str(header)[:80]}; expected is [type name, fields].")
+    raise InvalidMessageError(
+        f"codec: the payload's header is {str(header)[:_MAX_SHOWN]} (needed [type name, fields]).",
+        code="invalid_header",
+    )
 
 
-def _checked(value: Any, hint: Any, label: str) -> Any:
+def _check_field(value: Any, hint: Any, label: str) -> Any:
     """Return a plain field as its type; nothing is converted but lists to tuples and values to enum members."""
     if is_dataclass(hint) and isinstance(hint, type):
         schema = _schema(hint)
         if not isinstance(value, dict) or set(value) != {key for key, _ in schema}:
-            raise InvalidMessageError(f"{label} is {str(value)[:80]}; needed are the fields {[k for k, _ in schema]}.")
-        return hint(**{key: _checked(value[key], sub, f"{label}.{key}") for key, sub in schema})
+            raise _invalid_field(label, value, f"the fields {[k for k, _ in schema]}")
+        return hint(**{key: _check_field(value[key], sub, f"{label}.{key}") for key, sub in schema})
     if isinstance(hint, type) and issubclass(hint, Enum):
         known = {member.value: member for member in hint}
         if not isinstance(value, str) or value not in known:
-            raise InvalidMessageError(f"{label} is {str(value)[:80]!r}; allowed: {', '.join(known)}.")
+            raise _invalid_field(label, value, ", ".join(known))
         return known[value]
     if get_args(hint) == (str, ...):
         if not isinstance(value, list):
-            raise InvalidMessageError(f"{label} is {str(value)[:80]!r}; it must be a list of texts.")
-        return tuple(_checked(item, str, f"{label}[{i}]") for i, item in enumerate(value))
+            raise _invalid_field(label, value, "a list of texts")
+        return tuple(_check_field(item, str, f"{label}[{i}]") for i, item in enumerate(value))
     if type(value) is not hint:
-        raise InvalidMessageError(f"{label} is {str(value)[:80]!r}; it must be of type {hint}.")
+        raise _invalid_field(label, value, f"type {hint}")
     if hint is float and not math.isfinite(value):
-        raise InvalidMessageError(f"{label} is {value}; it must be finite.")
+        raise _invalid_field(label, value, "finite values")
     return value
 
 
-def _take_array(body: memoryview, at: int, shape: Any, dtype: np.dtype, label: str) -> tuple[np.ndarray, int]:
+def _invalid_field(label: str, value: Any, allowed: str) -> InvalidMessageError:
+    text = f"codec: {label} is {str(value)[:_MAX_SHOWN]!r} (allowed {allowed})."
+    return InvalidMessageError(text, code="invalid_field")
+
+
+def _read_array(body: memoryview, at: int, shape: Any, dtype: np.dtype, label: str) -> tuple[np.ndarray, int]:
     good = isinstance(shape, list) and len(shape) <= 4 and all(type(n) is int and 0 <= n <= MAX_BYTES for n in shape)
-    # Also of an empty array: numpy multiplies the lengths that are not zero.
+    # Lengths of 0 count as 1, since NumPy multiplies the lengths that are not zero.
     if not good or math.prod(max(n, 1) for n in shape) > MAX_BYTES:
-        raise InvalidMessageError(f"{label} has shape {str(shape)[:80]}; it must be a short list of lengths.")
+        raise InvalidMessageError(
+            f"codec: {label} has shape {str(shape)[:_MAX_SHOWN]} (allowed a short list of lengths).",
+            code="invalid_array",
+        )
     end = at + math.prod(shape) * dtype.itemsize
     if end > len(body):
-        raise InvalidMessageError(f"{label} with shape {shape} needs {end - at} bytes; {len(body) - at} are there.")
+        raise InvalidMessageError(
+            f"codec: {label} with shape {shape} needs {end - at} bytes ({len(body) - at} left).", code="invalid_array"
+        )
     raw = body[at:end]
     if dtype == np.bool_ and len(raw) and np.frombuffer(raw, np.uint8).max() > 1:
-        raise InvalidMessageError(f"{label} holds bytes other than 0 and 1; it must be a mask.")
+        raise InvalidMessageError(f"codec: {label} has bytes other than 0 and 1 (needed a mask).", code="invalid_array")
     return np.frombuffer(raw, dtype).reshape(shape), end
 
 
@@ -219,8 +253,8 @@ def decode_text(data: bytes, label: str) -> str:
         InvalidMessageError: too long, or not UTF-8.
     """
     if len(data) > _MAX_TEXT:
-        raise InvalidMessageError(f"{label} has {len(data)} bytes; allowed are {_MAX_TEXT}.")
+        raise InvalidMessageError(f"codec: {label} has {len(data)} bytes (allowed {_MAX_TEXT}).", code="invalid_text")
     try:
         return data.decode()
     except UnicodeDecodeError as err:
-        raise InvalidMessageError(f"{label} is {data[:40]!r}; it must be UTF-8 text.") from err
+        raise InvalidMessageError(f"codec: {label} is {data[:40]!r} (needed UTF-8 text).", code="invalid_text") from err

@@ -22,11 +22,12 @@ _FRAMES_IN_POOL = 6
 """One being written, one in flight, and the newest held by each of a few listeners."""
 _BYTES_PER_PIXEL = 3 + 4 + 1  # colour, depth, mask
 _STAMP = struct.Struct("<ddQ")
+_MAX_TIME_S = 1e12
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FrameStamp:
-    """What travels beside a frame, so that nobody unpacks a frame to learn that it is not wanted."""
+    """Attachment of a frame, by which a client drops a stale frame without decoding it."""
 
     sent_s: float
     """The HAL's clock at the moment of sending [s]."""
@@ -47,10 +48,16 @@ class FrameStamp:
             InvalidMessageError: wrong length, or a time that is not finite.
         """
         if len(data) != _STAMP.size:
-            raise InvalidMessageError(f"a frame's stamp has {len(data)} bytes; it must have {_STAMP.size}.")
+            raise InvalidMessageError(
+                f"bus: a frame's stamp has {len(data)} bytes (allowed {_STAMP.size}).", code="invalid_stamp"
+            )
         sent_s, exposed_s, sequence = _STAMP.unpack(data)
-        if not (abs(sent_s) < 1e12 and abs(exposed_s) < 1e12):
-            raise InvalidMessageError(f"a frame's stamp holds the times {sent_s} and {exposed_s}.")
+        # Also catches NaN; no clock of a machine reaches 30,000 years.
+        if not (abs(sent_s) < _MAX_TIME_S and abs(exposed_s) < _MAX_TIME_S):
+            raise InvalidMessageError(
+                f"bus: a frame's stamp has the times {sent_s} and {exposed_s} (allowed below {_MAX_TIME_S:g} s).",
+                code="invalid_stamp",
+            )
         return FrameStamp(sent_s=sent_s, exposed_s=exposed_s, sequence=sequence)
 
 
@@ -62,12 +69,12 @@ class FrameBuffers:
         before = existing_segments()
         size = _FRAMES_IN_POOL * (_BYTES_PER_PIXEL * intrinsics.width * intrinsics.height + 4096)
         self._provider = _make_provider(size) if shared else None
-        # Not before the end: Zenoh's own records are the process's, and a later provider needs them too.
+        # Not before the process ends: Zenoh's own records belong to it, and a later provider needs them too.
         atexit.register(unlink_segments, mapped_segments() - before)
 
     @property
     def shared(self) -> bool:
-        """Whether frames go through shared memory."""
+        """True when frames go through shared memory."""
         return self._provider is not None
 
     def fill(self, frame: RgbdFrame) -> shm.ZShmMut | bytes:
@@ -84,19 +91,19 @@ class FrameBuffers:
         return bytes(self._buffer)
 
     def close(self) -> None:
-        """Give the shared memory back; readers that still hold a frame keep it until they let go."""
+        """Free the shared memory; a reader that still holds a frame keeps it until it drops the frame."""
         self._provider = None
 
 
 def _make_provider(size: int) -> shm.ShmProvider | None:
-    # A segment larger than what /dev/shm has left is granted, and kills the writer with SIGBUS later: look first.
+    # A segment larger than the space left in /dev/shm is granted, and kills the writer with SIGBUS later: check first.
     try:
         space = os.statvfs(_SHM_DIR)
         free = space.f_bavail * space.f_frsize
         if free < 2 * size:
             raise OSError(f"{_SHM_DIR} has {free / 2**20:.0f} MiB left; {2 * size / 2**20:.0f} are needed")
         provider = shm.ShmProvider.default_backend(size)
-        provider.alloc(1)  # makes the segment of Zenoh's own records too
+        provider.alloc(1)  # creates the segment of Zenoh's own records too
     except (OSError, zenoh.ZError) as err:
         _LOG.warning("no shared memory (%s): frames go as bytes over the link, a few milliseconds slower.", err)
         return None
@@ -119,6 +126,6 @@ def mapped_segments() -> set[Path]:
 
 
 def unlink_segments(segments: set[Path]) -> None:
-    """Remove shared-memory files that Zenoh 1.10 leaves behind when the process that made them ends first."""
+    """Remove shared-memory files that Zenoh 1.10 leaves behind when the process that created them ends first."""
     for path in segments:
         path.unlink(missing_ok=True)

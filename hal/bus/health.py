@@ -1,4 +1,4 @@
-"""How well a HAL process does its work, for whoever wants to know and commands nothing."""
+"""Health of a HAL process, for clients that command nothing."""
 
 from __future__ import annotations
 
@@ -18,17 +18,18 @@ def wait_for_health(config: BusConfig, clock: Clock, timeout_s: float = 3.0) -> 
     """Return the next health that the HAL process publishes, within about a second.
 
     Raises:
-        HalTimeoutError: no HAL process answers, or it publishes none.
-        InvalidMessageError: what it publishes is none.
+        HalTimeoutError: no HAL process answers, or it publishes no health (`no_health`).
+        InvalidMessageError: the published message is malformed.
     """
-    heard: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+    messages: queue.SimpleQueue[bytes] = queue.SimpleQueue()
     link = BusLink(config, clock, "the HAL's health")
-    listener = Listener(link.session, keys.HEALTH, lambda sample: heard.put(as_bytes(sample.payload)))
+    listener = Listener(link.session, keys.HEALTH, lambda sample: messages.put(as_bytes(sample.payload)))
     try:
-        return decode(heard.get(timeout=timeout_s), ServoHealth)
+        return decode(messages.get(timeout=timeout_s), ServoHealth)
     except queue.Empty as err:
         raise HalTimeoutError(
-            f"the HAL process at {config.endpoint} published no health within {timeout_s:g} s; look at its log."
+            f"bus: the HAL process at {config.endpoint} published no health within {timeout_s:g} s. Check its log.",
+            code="no_health",
         ) from err
     finally:
         listener.close()
@@ -37,7 +38,9 @@ def wait_for_health(config: BusConfig, clock: Clock, timeout_s: float = 3.0) -> 
 
 def describe_health(health: ServoHealth) -> str:
     """Return `health` in one line."""
-    command = f"{health.owner} heard {1e3 * health.command_age_s:.0f} ms ago" if health.owner else "nobody commands"
+    command = "no command owner"
+    if health.owner:
+        command = f"last command of {health.owner} {1e3 * health.command_age_s:.0f} ms ago"
     faults = f"; {'; '.join(health.faults)}" if health.faults else ""
     return (
         f"servo {health.mode.value} at {health.rate_hz:.1f} Hz, period p50 {health.period_ms_p50:.2f}, "

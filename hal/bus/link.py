@@ -1,4 +1,4 @@
-"""A client's end of the link: one session, and questions to the HAL that end in an answer or in a typed error."""
+"""A client's end of the link: one session, and requests to the HAL that end in an answer or in a typed error."""
 
 from __future__ import annotations
 
@@ -10,23 +10,25 @@ from hal.base.clock import Clock
 from hal.base.errors import HalError, HalTimeoutError, NotConnectedError
 from hal.bus import keys
 from hal.bus.codec import Hello, decode
+from hal.bus.error_codec import decode_error
 from hal.bus.frames import existing_segments, mapped_segments, unlink_segments
 from hal.bus.service import as_bytes
-from hal.bus.session import BusConfig, nobody_answers, open_session
-from hal.bus.wire_errors import decode_error
+from hal.bus.session import BusConfig, no_answer_error, open_session
 
 _RETRY_S = 0.05
+_ZENOH_TIMEOUT = b"Timeout"  # payload of the error reply with which Zenoh itself ends an unanswered query
 _SAME_CLOCK_S = 0.05
-"""Both ends on one machine read the same clock; what the exchange of stamps seems to differ by is its own delay."""
+"""Maximum clock offset taken as zero: on one machine both ends read the same clock, and an apparent offset is the
+delay of the exchange itself."""
 
 
 class BusLink:
-    """An open connection to a HAL process that has said hello.
+    """An open connection to a HAL process, after the handshake.
 
     Args:
-        config: where it is.
+        config: address and timeouts.
         clock: this process's.
-        device: what the caller is, for the text of errors.
+        device: name of the caller's device, for error texts.
 
     Raises:
         HalTimeoutError: no HAL process answers for this robot.
@@ -42,19 +44,19 @@ class BusLink:
         self.session = open_session(config, listen=False)
         self._segments = mapped_segments() - before
         try:
-            self.hello, self.clock_offset_s = self._greet()
+            self.hello, self.clock_offset_s = self._handshake()
         except HalError:
             self.close()
             raise
 
-    def ask(self, key: str, payload: bytes = b"", owner: str = "") -> bytes:
+    def request(self, key: str, payload: bytes = b"", owner: str = "") -> bytes:
         """Return the answer of the service at `key`.
 
         Raises:
-            HalTimeoutError: no answer.
-            HalError: whatever the service raised, as the same class.
+            HalTimeoutError: no answer (`no_answer`), or no HAL process (`no_hal`).
+            HalError: the error of the service, with its class, code and text.
         """
-        asked_s = self._clock.now_s()
+        sent_s = self._clock.now_s()
         try:
             replies = list(self._querier(key).get(payload=payload, attachment=owner.encode()))
         except zenoh.ZError as err:
@@ -63,13 +65,13 @@ class BusLink:
             if reply.ok is not None:
                 return reply.ok.payload.to_bytes()
             text = as_bytes(reply.err.payload) if reply.err is not None else b""
-            if text == b"Timeout":  # Zenoh's own
+            if text == _ZENOH_TIMEOUT:
                 raise self._no_answer(key)
             raise decode_error(text)
-        # Nothing at once: nobody was asked. Nothing after the timeout: the other end of Zenoh gave up before this one.
-        if self._clock.now_s() - asked_s > 0.5 * self._config.request_timeout_s:
+        # No reply at once: no service exists. No reply after the timeout: the other end of Zenoh gave up first.
+        if self._clock.now_s() - sent_s > 0.5 * self._config.request_timeout_s:
             raise self._no_answer(key)
-        raise nobody_answers(self._config)
+        raise no_answer_error(self._config)
 
     def close(self) -> None:
         """End the session."""
@@ -78,8 +80,9 @@ class BusLink:
 
     def _no_answer(self, key: str) -> HalTimeoutError:
         return HalTimeoutError(
-            f"{key}: the HAL process at {self._config.endpoint} gave no answer within "
-            f"{self._config.request_timeout_s} s; look at its log."
+            f"bus: the HAL process at {self._config.endpoint} gave no answer to {key} within "
+            f"{self._config.request_timeout_s} s. Check its log.",
+            code="no_answer",
         )
 
     def _querier(self, key: str) -> zenoh.Querier:
@@ -94,19 +97,19 @@ class BusLink:
                 )
             return self._queriers[key]
 
-    def _greet(self) -> tuple[Hello, float]:
-        """Return the HAL's hello, and its clock minus ours [s]."""
+    def _handshake(self) -> tuple[Hello, float]:
+        """Return the HAL's hello, and the offset of its clock from this one [s]."""
         give_up_s = self._clock.now_s() + self._config.connect_timeout_s
         pause = threading.Event()
         while True:
-            asked_s = self._clock.now_s()
+            sent_s = self._clock.now_s()
             try:
-                hello = decode(self.ask(keys.HELLO), Hello)
+                hello = decode(self.request(keys.HELLO), Hello)
             except HalTimeoutError:
-                # It listens before it serves, so a first silence may be a HAL process that is just starting.
+                # It listens before it serves, so a first request without answer may reach a starting HAL process.
                 if self._clock.now_s() >= give_up_s:
                     raise
                 pause.wait(_RETRY_S)
                 continue
-            offset_s = hello.now_s - 0.5 * (asked_s + self._clock.now_s())
+            offset_s = hello.now_s - 0.5 * (sent_s + self._clock.now_s())
             return hello, 0.0 if abs(offset_s) < _SAME_CLOCK_S else offset_s

@@ -30,13 +30,13 @@ _FRAMES_WAITING = 2
 class RemoteCamera:
     """The camera of a HAL process (`hal.base.camera.Camera`).
 
-    Holds the newest frame only, still packed; it is unpacked in the thread of whoever waits for it. Any number of
-    threads may wait at once. It listens from the first call that waits to the first frame that nobody waits for: what
-    nobody looks at is neither sent nor, in the twin, drawn.
+    It keeps only the newest frame, still encoded; each waiting thread decodes it for itself. Any number of threads may
+    wait at once. It listens from the first call that waits to the first frame for which no thread waits: an unused
+    frame is neither sent nor, in the twin, rendered.
 
     Args:
-        config: where the HAL process is.
-        clock: the wall's.
+        config: address of the HAL process.
+        clock: the wall clock.
     """
 
     def __init__(self, config: BusConfig | None = None, clock: Clock | None = None) -> None:
@@ -44,17 +44,17 @@ class RemoteCamera:
         self._clock = clock or WallClock()
         self._link: BusLink | None = None
         self._intrinsics: Intrinsics | None = None
-        self._news = threading.Condition()
-        # Below, all under `_news`.
+        self._changed = threading.Condition()
+        # Below, all under `_changed`.
         self._listener: Listener | None = None
         self._waiting = 0
         self._newest: tuple[FrameStamp, zenoh.ZBytes] | None = None
         self._last_sequence: int | None = None
         self._latencies_ms: deque[float] = deque(maxlen=_LATENCIES_KEPT)
         self.lost_frames = 0
-        """How many frames were sent and never arrived, since `connect()`."""
+        """Number of frames that were sent and never arrived, since `connect()`."""
         self.shared_memory = False
-        """Whether the last frame came through shared memory."""
+        """True when the last frame came through shared memory."""
 
     def connect(self) -> None:
         """Open the link and wait for the first frame. Harmless when open.
@@ -66,9 +66,9 @@ class RemoteCamera:
             return
         self.lost_frames = 0
         self._link = BusLink(self._config, self._clock, "the remote camera")
-        atexit.register(self.disconnect)  # a program that ends carelessly leaves no thread inside Zenoh
+        atexit.register(self.disconnect)  # a program that ends without it must leave no thread inside Zenoh
         try:
-            # The first frame is answered by a camera that may have to wake up.
+            # At least 1 s: before the first frame the camera may have to start its stream.
             self._intrinsics = self.wait_for_frame(max(self._config.connect_timeout_s, 1.0)).intrinsics
         except (HalTimeoutError, InvalidMessageError):
             self.disconnect()
@@ -76,12 +76,12 @@ class RemoteCamera:
         self._latencies_ms.clear()
 
     def disconnect(self) -> None:
-        """Close the link; who waits for a frame is told so. Harmless when not connected."""
-        with self._news:
+        """Close the link; a thread that waits for a frame gets `NotConnectedError`. No effect when not connected."""
+        with self._changed:
             link, self._link = self._link, None
             listener, self._listener = self._listener, None
             self._newest = None
-            self._news.notify_all()
+            self._changed.notify_all()
         if link is None:
             return
         atexit.unregister(self.disconnect)
@@ -107,7 +107,7 @@ class RemoteCamera:
 
     @property
     def frame_latencies_ms(self) -> tuple[float, ...]:
-        """From the HAL's sending to the unpacked frame here, of the last frames that were waited for [ms]."""
+        """Latencies from the HAL's sending to the decoded frame here, of the last frames waited for [ms]."""
         return tuple(self._latencies_ms)
 
     def frame_latency_ms(self, percentile: float) -> float:
@@ -119,24 +119,24 @@ class RemoteCamera:
         """Return the next frame exposed after this call began (see `hal.base.camera.Camera.wait_for_frame`).
 
         Raises:
-            InvalidMessageError: a frame came that cannot be read.
+            InvalidMessageError: a malformed frame arrived.
         """
         began_s = self._clock.now_s()
-        with self._news:
+        with self._changed:
             link = self._connected()
             self._waiting += 1
             if self._listener is None:
                 self._last_sequence = None
-                self._listener = Listener(link.session, keys.FRAME, self._take, waiting=_FRAMES_WAITING)
+                self._listener = Listener(link.session, keys.FRAME, self._on_frame, waiting=_FRAMES_WAITING)
         try:
             while True:
-                stamp, payload = self._wait_newer(link, began_s, timeout_s)
-                frame = self._unpack(stamp, payload)
+                stamp, payload = self._wait_for_newer(link, began_s, timeout_s)
+                frame = self._decode(stamp, payload)
                 if frame is not None:
                     self._latencies_ms.append(1e3 * (self._clock.now_s() + link.clock_offset_s - stamp.sent_s))
                     return frame
         finally:
-            with self._news:
+            with self._changed:
                 self._waiting -= 1
 
     def _connected(self) -> BusLink:
@@ -144,9 +144,9 @@ class RemoteCamera:
             raise NotConnectedError("the remote camera")
         return self._link
 
-    def _wait_newer(self, link: BusLink, began_s: float, timeout_s: float) -> tuple[FrameStamp, zenoh.ZBytes]:
+    def _wait_for_newer(self, link: BusLink, began_s: float, timeout_s: float) -> tuple[FrameStamp, zenoh.ZBytes]:
         give_up_s = began_s + timeout_s
-        with self._news:
+        with self._changed:
             while True:
                 if self._link is not link:
                     raise NotConnectedError("the remote camera")
@@ -155,31 +155,32 @@ class RemoteCamera:
                 left_s = give_up_s - self._clock.now_s()
                 if left_s <= 0:
                     raise HalTimeoutError(
-                        f"no new frame from {self._config.endpoint} within {timeout_s} s; "
-                        f"look at the HAL process's log and the camera's cable."
+                        f"bus: no new frame from {self._config.endpoint} within {timeout_s} s. "
+                        f"Check the HAL process's log and the camera's cable.",
+                        code="no_frame",
                     )
-                self._news.wait(left_s)
+                self._changed.wait(left_s)
 
-    def _unpack(self, stamp: FrameStamp, payload: zenoh.ZBytes) -> RgbdFrame | None:
+    def _decode(self, stamp: FrameStamp, payload: zenoh.ZBytes) -> RgbdFrame | None:
         shared = payload.as_shm()
         data = payload.to_bytes()
-        # Shared memory is taken back from a reader that stood still for too long: then what was copied may be torn.
+        # Zenoh reclaims shared memory from a reader that stalls for too long: the copy may then be torn.
         if shared is not None and not shared.is_valid():
-            _LOG.warning("a frame was overwritten while it was read; waiting for the next.")
-            with self._news:
+            _LOG.warning("bus: a frame was overwritten while it was read; waiting for the next.")
+            with self._changed:
                 if self._newest is not None and self._newest[0] is stamp:
                     self._newest = None
             return None
         self.shared_memory = shared is not None
         return decode(data, RgbdFrame)
 
-    def _take(self, sample: zenoh.Sample) -> None:
+    def _on_frame(self, sample: zenoh.Sample) -> None:
         try:
             stamp = FrameStamp.unpack(as_bytes(sample.attachment))
         except InvalidMessageError as error:
-            _LOG.warning("a frame was dropped: %s", error)
+            _LOG.warning("bus: a frame was dropped: %s", error)
             return
-        with self._news:
+        with self._changed:
             if self._listener is None:  # disconnected
                 return
             if not self._waiting:
@@ -190,4 +191,4 @@ class RemoteCamera:
                 self.lost_frames += stamp.sequence - self._last_sequence - 1
             self._last_sequence = stamp.sequence
             self._newest = (stamp, sample.payload)
-            self._news.notify_all()
+            self._changed.notify_all()

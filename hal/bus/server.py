@@ -1,15 +1,15 @@
 """The HAL's end of the link: publishes state, status and frames, and takes commands for one servo.
 
-What goes which way, and why:
+Messages, directions and quality of service:
 
 * State and status: put at 100 Hz, REAL_TIME, DROP, express. The newest replaces the one before.
 * Health: put once a second.
-* Heartbeat: the same, from the owner. Losing one is harmless, five in a row make the servo brake.
-* Trajectory chunks: acked queries, not puts. A lost chunk would be noticed only by the arm running dry, and a refused
-  one not at all; an answer costs about 1 ms every 0.1 s.
-* Stop, re-arm, claim, release, send, status: acked queries, each on a thread of its own, so that a stop waits for
-  nobody. Stop and re-arm need no lease: whoever sees the arm may stop it.
-* Frames: put, DATA_LOW, DROP, in shared memory, only while somebody listens.
+* Heartbeat: put by the owner at 50 Hz, the same. One may be lost; seven in a row make the servo brake.
+* Trajectory chunks: acked queries, not puts. A lost chunk would show only as a buffer underrun, and a rejected one not
+  at all; an answer costs about 1 ms every 0.1 s.
+* Stop, re-arm, claim, release, send, status: acked queries, each on a thread of its own, so that a stop waits for no
+  other. Stop and re-arm need no lease: every client may stop the arm.
+* Frames: put, DATA_LOW, DROP, in shared memory, only while a client listens.
 """
 
 from __future__ import annotations
@@ -30,18 +30,19 @@ from hal.base.messages import ArmSetpoint, ServoHealth, TrajectoryChunk
 from hal.bus import keys
 from hal.bus.codec import VERSION, Hello, decode, decode_text, encode
 from hal.bus.frames import FrameBuffers, FrameStamp, existing_segments, mapped_segments, unlink_segments
-from hal.bus.service import Answer, GuardedThread, Listener, Service, as_bytes
+from hal.bus.service import Listener, RequestHandler, Service, ServiceThread, as_bytes
 from hal.bus.session import BusConfig, open_session
 
 _LOG = logging.getLogger(__name__)
+_ANONYMOUS = "anonymous"  # owner of a message without a name; clients always have one, with a suffix
 _FRAME_TIMEOUT_S = 1.0
-_IDLE_S = 0.2
+_RETRY_S = 0.2  # pause after a camera error, so that a camera that fails at once does not occupy a core
 _HEALTH_PERIOD_S = 1.0
-_HEARTBEATS_WAITING = 16
+_HEARTBEATS_WAITING = 16  # 0.3 s at 50 Hz, twice the heartbeat's timeout
 
 
 class OwnedServo(ServoedArm, Protocol):
-    """What the server needs of `hal.servo.servo.Servo`: a servoed arm that tells its callers apart, thread-safe."""
+    """Interface of `hal.servo.servo.Servo` for the server: a thread-safe servoed arm whose commands name the owner."""
 
     def release(self, owner: str | None = None) -> None: ...
 
@@ -62,8 +63,8 @@ class HalServer:
     Args:
         servo: thread-safe; its ticks run elsewhere.
         camera: used by this server's frame thread alone.
-        clock: the wall's; paces the publishing and stamps what is sent.
-        config: where to listen.
+        clock: the wall clock; paces the publishing and stamps the messages.
+        config: address to listen on.
 
     Raises:
         HalError: the port is taken.
@@ -76,7 +77,7 @@ class HalServer:
         self._config = config
         self._closing = Event()
         self.failed = Event()
-        """Set when a thread of the server died; the process should then stop the arm and end."""
+        """Set when an error ended a thread of the server; the process should then stop the arm and end."""
         self._buffers = FrameBuffers(camera.intrinsics, shared=config.shared_memory)
         before = existing_segments()
         try:
@@ -85,12 +86,12 @@ class HalServer:
             self._buffers.close()
             raise
         self._segments = mapped_segments() - before
-        self._threads: list[GuardedThread] = []
-        self._deaf = _Complaint("a heartbeat is not taken")
+        self._threads: list[ServiceThread] = []
+        self._heartbeat_warning = _StateChangeWarning("heartbeat rejected")
         self._start_publishing()
         self._services = [
-            Service(self._session, key, answer, self.failed.set, heed_anyone=key == keys.STOP)
-            for key, answer in self._answers()
+            Service(self._session, key, handle, self.failed.set, allow_anonymous=key == keys.STOP)
+            for key, handle in self._request_handlers()
         ]
 
     def __enter__(self) -> HalServer:
@@ -100,14 +101,14 @@ class HalServer:
         self.close()
 
     def close(self) -> None:
-        """Answer nobody any more, end all threads, leave nothing in shared memory. Harmless when done before."""
+        """Stop all services, end all threads, and free the shared memory. No effect when closed before."""
         if self._closing.is_set():
             return
         self._closing.set()
         for service in self._services:
             service.close()
         self._heartbeats.close()
-        self._watchers.undeclare()
+        self._frame_listeners.undeclare()
         for thread in self._threads:
             thread.join()
         self._session.close()
@@ -127,13 +128,13 @@ class HalServer:
         self._frames = session.declare_publisher(
             keys.FRAME, priority=zenoh.Priority.DATA_LOW, congestion_control=zenoh.CongestionControl.DROP
         )
-        self._watchers = self._frames.declare_matching_listener(zenoh.handlers.RingChannel(1))
+        self._frame_listeners = self._frames.declare_matching_listener(zenoh.handlers.RingChannel(1))
         self._heartbeats = Listener(
             session,
             keys.HEARTBEAT,
-            self._take_heartbeat,
+            self._on_heartbeat,
             waiting=_HEARTBEATS_WAITING,
-            on_death=self.failed.set,
+            on_failure=self.failed.set,
         )
         loops: dict[str, Callable[[], None]] = {
             "bus state": self._publish_state,
@@ -141,23 +142,23 @@ class HalServer:
             "bus frames": self._publish_frames,
         }
         for name, loop in loops.items():
-            self._threads.append(GuardedThread(name, loop, self.failed.set))
+            self._threads.append(ServiceThread(name, loop, self.failed.set))
             self._threads[-1].start()
 
-    # --- What is published ----------------------------------------------------------------------------------------
+    # --- Publishing -----------------------------------------------------------------------------------------------
 
     def _publish_state(self) -> None:
         period_s = 1.0 / self._config.state_rate_hz
-        complaint = _Complaint("the arm's state is not published")
+        warning = _StateChangeWarning("arm state not published")
         due_s = self._clock.now_s()
         while not self._closing.is_set():
-            self._status.put(encode(self._servo.status()))  # above all when the arm is silent
+            self._status.put(encode(self._servo.status()))  # first: it is needed most when the arm is silent
             try:
                 self._state.put(encode(self._servo.read_state()))
-                complaint.over()
+                warning.clear()
             except HalError as error:
-                complaint.say(error)
-            # Late cycles move the following ones: nothing is sent twice to catch up.
+                warning.warn(error)
+            # A late cycle shifts the following ones: nothing is sent twice to catch up.
             due_s = max(due_s + period_s, self._clock.now_s())
             self._clock.sleep_until(due_s)
 
@@ -165,46 +166,46 @@ class HalServer:
         while not self._closing.wait(_HEALTH_PERIOD_S):
             self._health.put(encode(self._servo.health()))
 
-    def _watched(self) -> Iterator[None]:
-        """Yield again and again while somebody listens to frames; wait while nobody does; end at `close()`."""
-        changes = self._watchers.handler
-        # Who kept its session through a restart of this process listens already.
-        watched = self._frames.matching_status.matching  # pyright: ignore[reportAttributeAccessIssue] (its stub is wrong)
+    def _while_listened(self) -> Iterator[None]:
+        """Yield repeatedly while a client listens to frames; wait while none does; end at `close()`."""
+        changes = self._frame_listeners.handler
+        # A client that kept its session through a restart of this process listens already.
+        listened = self._frames.matching_status.matching  # pyright: ignore[reportAttributeAccessIssue] (its stub is wrong)
         while not self._closing.is_set():
             try:
-                change = changes.try_recv() if watched else changes.recv()
+                change = changes.try_recv() if listened else changes.recv()
             except zenoh.ZError:  # closed
                 return
-            watched = watched if change is None else change.matching
-            if watched:
+            listened = listened if change is None else change.matching
+            if listened:
                 yield
 
     def _publish_frames(self) -> None:
-        complaint = _Complaint("no frames are published")
-        for _ in self._watched():
+        warning = _StateChangeWarning("frames not published")
+        for _ in self._while_listened():
             try:
                 frame = self._camera.wait_for_frame(_FRAME_TIMEOUT_S)
                 payload = self._buffers.fill(frame)
             except HalError as error:
-                complaint.say(error)
-                self._closing.wait(_IDLE_S)
+                warning.warn(error)
+                self._closing.wait(_RETRY_S)
                 continue
-            complaint.over()
+            warning.clear()
             stamp = FrameStamp(sent_s=self._clock.now_s(), exposed_s=frame.stamp_s, sequence=frame.sequence)
             self._frames.put(payload, attachment=stamp.pack())
 
-    # --- What is taken --------------------------------------------------------------------------------------------
+    # --- Commands -------------------------------------------------------------------------------------------------
 
-    def _take_heartbeat(self, sample: zenoh.Sample) -> None:
+    def _on_heartbeat(self, sample: zenoh.Sample) -> None:
         try:
-            self._servo.heartbeat(decode_text(as_bytes(sample.payload), "the heartbeat") or "nobody")
-            self._deaf.over()
+            self._servo.heartbeat(decode_text(as_bytes(sample.payload), "the heartbeat") or _ANONYMOUS)
+            self._heartbeat_warning.clear()
         except LeaseError:
-            pass  # a client that has just lost the lease is told so at its next command
+            pass  # a client that has just lost the lease gets the error of its next command
         except HalError as error:
-            self._deaf.say(error)
+            self._heartbeat_warning.warn(error)
 
-    def _answers(self) -> list[tuple[str, Answer]]:
+    def _request_handlers(self) -> list[tuple[str, RequestHandler]]:
         servo = self._servo
 
         def claim(owner: str, _: bytes) -> bytes:
@@ -212,7 +213,7 @@ class HalServer:
             return b""
 
         def release(owner: str, _: bytes) -> bytes:
-            servo.release(owner or "nobody")
+            servo.release(owner or _ANONYMOUS)
             return b""
 
         def stream(owner: str, data: bytes) -> bytes:
@@ -223,7 +224,7 @@ class HalServer:
             return encode(servo.send(decode(data, ArmSetpoint), owner=owner))
 
         def stop(owner: str, data: bytes) -> bytes:
-            servo.stop(_readable(data) or f"stop requested by {owner or 'somebody'}")
+            servo.stop(_decode_reason(data) or f"stop requested by {owner or _ANONYMOUS}")
             return b""
 
         def rearm(_: str, __: bytes) -> bytes:
@@ -241,7 +242,7 @@ class HalServer:
             (keys.SEND, send),
             (keys.REARM, rearm),
             (keys.READ_STATUS, status),
-            (keys.HELLO, self._hello),  # last: whoever gets an answer here finds all the others too
+            (keys.HELLO, self._hello),  # last: a client that gets its answer finds all other services running
         ]
 
     def _hello(self, _: str, __: bytes) -> bytes:
@@ -250,29 +251,30 @@ class HalServer:
         return encode(hello)
 
 
-def _readable(reason: bytes) -> str:
-    # A stop is obeyed whatever it carries.
+def _decode_reason(reason: bytes) -> str:
+    # A stop is executed whatever its payload.
     try:
         return decode_text(reason, "the reason")
     except InvalidMessageError as error:
-        _LOG.warning("a stop came with an unreadable reason: %s", error)
+        _LOG.warning("a stop has an unreadable reason: %s", error)
         return ""
 
 
-class _Complaint:
-    """Logs a trouble when it begins and when it is over, not at every cycle in between."""
+class _StateChangeWarning:
+    """A warning logged when a failure begins and when it is over, not at every cycle in between."""
 
-    def __init__(self, what: str) -> None:
-        self._what = what
-        self._text = ""
+    def __init__(self, failure: str) -> None:
+        self._failure = failure
+        self._kind: tuple[type[HalError], str] | None = None
 
-    def say(self, error: HalError) -> None:
-        # Texts hold stamps and ages: the class tells one trouble from another.
-        if self._text != type(error).__name__:
-            self._text = type(error).__name__
-            _LOG.warning("%s: %s", self._what, error)
+    def warn(self, error: HalError) -> None:
+        """Log `error`, unless the last one was of the same class and code (texts hold stamps and ages)."""
+        if self._kind != (kind := (type(error), error.code)):
+            self._kind = kind
+            _LOG.warning("%s: %s", self._failure, error)
 
-    def over(self) -> None:
-        if self._text:
-            self._text = ""
-            _LOG.info("over: %s", self._what)
+    def clear(self) -> None:
+        """Log the end of the failure, if there was one."""
+        if self._kind is not None:
+            self._kind = None
+            _LOG.info("over: %s", self._failure)

@@ -1,7 +1,7 @@
-"""Threads that receive: one for each acked query, so that no service ever waits for another, one for each topic.
+"""Receiving threads: one for each acked query, so that no service waits for another, and one for each topic.
 
 Zenoh's own callbacks are not used: they run on threads that are not daemons, for which a program that ends with its
-session still open would wait for ever.
+session still open would wait forever.
 """
 
 from __future__ import annotations
@@ -15,21 +15,21 @@ import zenoh
 
 from hal.base.errors import HalError, InvalidMessageError
 from hal.bus.codec import decode_text
-from hal.bus.wire_errors import encode_error
+from hal.bus.error_codec import encode_error
 
 _LOG = logging.getLogger(__name__)
 _WAITING = 32
-"""How many queries may wait for one service; beyond that the oldest are dropped, and their askers time out."""
+"""Maximum number of queries that wait for one service; beyond it the oldest are dropped, and their clients time out."""
 
-Answer = Callable[[str, bytes], bytes]
-"""Takes the asker's name and the payload, returns the answer's payload; a `HalError` goes back as itself."""
+RequestHandler = Callable[[str, bytes], bytes]
+"""Takes the requester's name and the payload, returns the answer's payload; a `HalError` travels back as itself."""
 
 
-def received(handler: Any) -> Iterator[Any]:
-    """Yield what `handler` receives until it is undeclared.
+def receive_items(handler: Any) -> Iterator[Any]:
+    """Yield the items that `handler` receives until it is undeclared.
 
-    The handler, not its queryable or subscriber, is what a thread may wait on: Zenoh 1.10 refuses to undeclare what
-    another thread is receiving on.
+    A thread has to wait on the handler, not on its queryable or subscriber: Zenoh 1.10 cannot undeclare one on which
+    another thread is receiving.
     """
     while True:
         try:
@@ -39,13 +39,13 @@ def received(handler: Any) -> Iterator[Any]:
         yield item
 
 
-class GuardedThread(Thread):
-    """A daemon thread that reports it when it dies of something nobody expected, and lets the error show."""
+class ServiceThread(Thread):
+    """A daemon thread that calls `on_failure` when an unexpected error ends it; the traceback is printed as usual."""
 
-    def __init__(self, name: str, run: Callable[[], None], on_death: Callable[[], None]) -> None:
+    def __init__(self, name: str, run: Callable[[], None], on_failure: Callable[[], None]) -> None:
         super().__init__(name=name, daemon=True)
         self._work = run
-        self._on_death = on_death
+        self._on_death = on_failure
 
     def run(self) -> None:
         ended = False
@@ -62,39 +62,39 @@ class Listener:
 
     Args:
         session: open Zenoh session.
-        key: what is listened to.
-        take: called with each sample.
-        waiting: how many samples may wait; beyond that the oldest are dropped.
-        on_death: called when the thread dies of an unexpected error.
+        key: key expression of the topic.
+        on_sample: called with each sample.
+        waiting: maximum number of samples that wait; beyond it the oldest are dropped.
+        on_failure: called when an unexpected error ends the thread.
     """
 
     def __init__(
         self,
         session: zenoh.Session,
         key: str,
-        take: Callable[[zenoh.Sample], None],
+        on_sample: Callable[[zenoh.Sample], None],
         *,
         waiting: int = 1,
-        on_death: Callable[[], None] = lambda: None,
+        on_failure: Callable[[], None] = lambda: None,
     ) -> None:
-        self._take = take
+        self._on_sample = on_sample
         self._closing = False
         self._subscriber = session.declare_subscriber(key, zenoh.handlers.RingChannel(waiting))
-        self._thread = GuardedThread(f"bus {key}", self._run, on_death)
+        self._thread = ServiceThread(f"bus {key}", self._run, on_failure)
         self._thread.start()
 
     def close(self) -> None:
-        """Listen no more; waits for the sample in hand, except when called by `take` itself."""
+        """Stop listening; waits for the sample in progress, except when called by `on_sample` itself."""
         self._closing = True
         self._subscriber.undeclare()
         if self._thread is not current_thread():
             self._thread.join()
 
     def _run(self) -> None:
-        for sample in received(self._subscriber.handler):
-            if self._closing:  # what was still waiting
+        for sample in receive_items(self._subscriber.handler):
+            if self._closing:  # samples that were still waiting
                 return
-            self._take(sample)
+            self._on_sample(sample)
 
 
 class Service:
@@ -102,63 +102,63 @@ class Service:
 
     Args:
         session: open Zenoh session.
-        key: where it is asked.
-        answer: what it does.
-        on_death: called when the thread dies of an unexpected error.
-        heed_anyone: serve a query whose asker's name cannot be read, too (the stop).
+        key: key expression of the queries.
+        handle: answers a query.
+        on_failure: called when an unexpected error ends the thread.
+        allow_anonymous: also serve a query whose requester's name is unreadable (the stop).
     """
 
     def __init__(
         self,
         session: zenoh.Session,
         key: str,
-        answer: Answer,
-        on_death: Callable[[], None],
+        handle: RequestHandler,
+        on_failure: Callable[[], None],
         *,
-        heed_anyone: bool = False,
+        allow_anonymous: bool = False,
     ) -> None:
         self._key = key
-        self._answer = answer
-        self._heed_anyone = heed_anyone
-        # A ring, not a FIFO: a full FIFO would hold up the thread that receives for the whole session.
+        self._handle = handle
+        self._allow_anonymous = allow_anonymous
+        # A ring, not a FIFO: a full FIFO would block the thread that receives for the whole session.
         self._queryable = session.declare_queryable(key, zenoh.handlers.RingChannel(_WAITING))
-        self._thread = GuardedThread(f"bus {key}", self._run, on_death)
+        self._thread = ServiceThread(f"bus {key}", self._run, on_failure)
         self._thread.start()
 
     def close(self) -> None:
-        """Answer no more; waits for the answer in hand."""
+        """Stop answering; waits for the answer in progress."""
         self._queryable.undeclare()
         self._thread.join()
 
     def _run(self) -> None:
-        for query in received(self._queryable.handler):
+        for query in receive_items(self._queryable.handler):
             with query:
                 self._serve(query)
 
     def _serve(self, query: zenoh.Query) -> None:
         try:
-            reply = self._answer(self._asker(query), as_bytes(query.payload))
+            reply = self._handle(self._requester(query), as_bytes(query.payload))
         except HalError as error:
             if isinstance(error, InvalidMessageError):
-                _LOG.warning("%s: refused a malformed request: %s", self._key, error)
-            refusal = encode_error(error)
-            self._send(lambda: query.reply_err(refusal))
+                _LOG.warning("%s: rejected a malformed request: %s", self._key, error)
+            rejection = encode_error(error)
+            self._send(lambda: query.reply_err(rejection))
         else:
             self._send(lambda: query.reply(self._key, reply, express=True))
 
-    def _asker(self, query: zenoh.Query) -> str:
+    def _requester(self, query: zenoh.Query) -> str:
         try:
-            return decode_text(as_bytes(query.attachment), "the asker's name")
+            return decode_text(as_bytes(query.attachment), "the requester's name")
         except InvalidMessageError:
-            if self._heed_anyone:
+            if self._allow_anonymous:
                 return ""
             raise
 
     def _send(self, reply: Callable[[], None]) -> None:
         try:
             reply()
-        except zenoh.ZError as err:  # the asker is gone, or the session is being closed
-            _LOG.debug("%s: the answer did not get out: %s", self._key, err)
+        except zenoh.ZError as err:  # the client is gone, or the session is being closed
+            _LOG.debug("%s: the answer was not sent: %s", self._key, err)
 
 
 def as_bytes(payload: zenoh.ZBytes | None) -> bytes:

@@ -1,4 +1,8 @@
-"""How the servo comes to rest, and how it joins one motion to the next, without a jump."""
+"""Braking to rest, tracking of a single target, and blends between motions, all without a jump in the command.
+
+A stop prefers the path that is being played (`PathStop`: same path, time slowed down). Where too little of it is
+buffered, or the command is off the path, every joint brakes by itself (`Brake`, jerk-limited by Ruckig).
+"""
 
 from __future__ import annotations
 
@@ -7,15 +11,15 @@ from ruckig import ControlInterface, InputParameter, Ruckig, Synchronization, Tr
 
 from hal.base.z1 import CONTROL_PERIOD_S, N_JOINTS
 from hal.servo.limits import ServoLimits
-from hal.servo.trajectory_buffer import Playback
+from hal.servo.trajectory_buffer import TrajectoryBuffer
 
-_HARDER = 1.25
-_ATTEMPTS = 10
-_SHORTEST_S = 10 * CONTROL_PERIOD_S
+_STEP_FACTOR = 1.25
+_MAX_ATTEMPTS = 10  # 1.25⁹ = 7.5 times the limits at the last one
+_MIN_STOP_S = 10 * CONTROL_PERIOD_S  # a stop from almost no speed still gets a few ticks to slow down in
 
 
 class Brake:
-    """Plans jerk-limited stops with Ruckig's velocity interface."""
+    """A planner of jerk-limited stops by Ruckig's velocity interface."""
 
     def __init__(self, limits: ServoLimits) -> None:
         self._limits = limits
@@ -27,23 +31,24 @@ class Brake:
         self._input.target_velocity = [0.0] * N_JOINTS
         self._input.target_acceleration = [0.0] * N_JOINTS
 
-    def plan(self, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> StopPath:
+    def plan(self, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> JointStop:
         """Return the stop from `q`, `dq`, `ddq` (7,) [rad, rad/s, rad/s²].
 
         Acceleration and jerk are the limits' for every joint that comes to rest in time and inside its position
         limits with them (Ruckig ignores `max_position`, so the extrema are checked here); a joint that does not
-        brakes harder, in steps of 25 %, up to nine times as hard.
+        brakes harder, in steps of 25 %, up to 7.5 times as hard.
         """
         limits, inp = self._limits, self._input
         inp.current_position = q.tolist()
         inp.current_velocity = dq.tolist()
         inp.current_acceleration = np.clip(ddq, -limits.ddq_max, limits.ddq_max).tolist()
+        # An arm that starts outside its limits may stay outside, but not go further.
         low, high = np.minimum(limits.q_min, q) - 1e-9, np.maximum(limits.q_max, q) + 1e-9
-        harder = np.ones(N_JOINTS)
+        factor = np.ones(N_JOINTS)
         path = Trajectory(N_JOINTS)
-        for _ in range(_ATTEMPTS):
-            inp.max_acceleration = (harder * limits.ddq_max).tolist()
-            inp.max_jerk = (harder * limits.dddq_max).tolist()
+        for _ in range(_MAX_ATTEMPTS):
+            inp.max_acceleration = (factor * limits.ddq_max).tolist()
+            inp.max_jerk = (factor * limits.dddq_max).tolist()
             self._ruckig.calculate(inp, path)
             extrema = path.position_extrema
             late = np.array(path.independent_min_durations) > limits.brake_s
@@ -51,17 +56,17 @@ class Brake:
             outside |= np.array([e.max for e in extrema]) > high
             if not (late | outside).any():
                 break
-            harder[late | outside] *= _HARDER
-        return StopPath(path)
+            factor[late | outside] *= _STEP_FACTOR
+        return JointStop(path)
 
 
-class StopPath:
-    """One planned stop."""
+class JointStop:
+    """A stop of every joint by itself, which leaves the path."""
 
     def __init__(self, path: Trajectory) -> None:
         self._path = path
         self.duration_s: float = path.duration
-        """How long it takes [s]."""
+        """Duration until the last joint is at rest [s]."""
 
     def at(self, t_s: float) -> tuple[np.ndarray, np.ndarray]:
         """Return position and velocity (7,) `t_s` [s] after the stop began."""
@@ -70,34 +75,35 @@ class StopPath:
 
 
 class PathStop:
-    """A stop on the path that is being played: its time runs ever slower, and the arm stays where it was to be."""
+    """A stop along the trajectory being played: its time slows down to zero, and the arm stays on the planned path."""
 
-    def __init__(self, path: Playback, start_s: float, duration_s: float) -> None:
+    def __init__(self, path: TrajectoryBuffer, start_s: float, duration_s: float) -> None:
         self._path, self._start_s = path, start_s
         self.duration_s = duration_s
-        """How long it takes [s]; the path's own time goes on by half of that."""
+        """Duration until rest [s]; the trajectory's own time advances by half of that."""
 
     def at(self, t_s: float) -> tuple[np.ndarray, np.ndarray]:
         """Return position and velocity (7,) `t_s` [s] after the stop began."""
+        # The time's rate is 1 − 3u² + 2u³: it starts at 1 and ends at 0, each with zero slope.
         u = min(t_s / self.duration_s, 1.0)
         q, dq = self._path.at(self._start_s + self.duration_s * (u - u**3 + 0.5 * u**4))
         return q, (1.0 - 3.0 * u**2 + 2.0 * u**3) * dq
 
 
-def plan_path_stop(path: Playback, start_s: float, limits: ServoLimits) -> PathStop | None:
-    """Return the stop on `path` from its time `start_s` [s]; None where too little of it is left to stop on.
+def plan_path_stop(path: TrajectoryBuffer, start_s: float, limits: ServoLimits) -> PathStop | None:
+    """Return the stop along `path` from its time `start_s` [s]; None where too little of it is buffered to stop on.
 
-    It takes as long as the limits of acceleration and jerk want for the speed there, but no longer than `brake_s`.
+    It lasts as long as the limits of acceleration and jerk need for the speed there, at most `brake_s`.
     """
-    speed = np.abs([path.at(start_s + share * limits.brake_s)[1] for share in (0.0, 0.25, 0.5)]).max(axis=0)
-    # What slowing down asks of a joint at most: 3/2 v/T and 6 v/T².
-    wanted_s = np.max([1.5 * speed / limits.ddq_max, np.sqrt(6.0 * speed / limits.dddq_max)])
-    duration_s = min(max(float(wanted_s), _SHORTEST_S), limits.brake_s)
+    speed = np.abs([path.at(start_s + ratio * limits.brake_s)[1] for ratio in (0.0, 0.25, 0.5)]).max(axis=0)
+    # Maxima of the slow-down 1 − 3u² + 2u³ over the duration T: acceleration 3/2 v/T, jerk 6 v/T².
+    needed_s = np.max([1.5 * speed / limits.ddq_max, np.sqrt(6.0 * speed / limits.dddq_max)])
+    duration_s = min(max(float(needed_s), _MIN_STOP_S), limits.brake_s)
     return PathStop(path, start_s, duration_s) if start_s + 0.5 * duration_s <= path.end_s else None
 
 
-class Chaser:
-    """Moves towards a target that may change every tick, with Ruckig's position interface."""
+class TargetTracker:
+    """An online trajectory generator to a target that may change every tick (Ruckig's position interface)."""
 
     def __init__(self, limits: ServoLimits) -> None:
         self._limits = limits
@@ -114,7 +120,7 @@ class Chaser:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return position, velocity and acceleration (7,) one control period after `q`, `dq`, `ddq` (7,).
 
-        They lie on the fastest way to rest at the target; one beyond the joint limits is taken as the limit.
+        They are on the fastest motion to rest at the target; a target beyond the joint limits is clipped to them.
         """
         limits, inp = self._limits, self._input
         inp.current_position = q.tolist()
@@ -127,19 +133,24 @@ class Chaser:
 
 
 class Blend:
-    """A difference in position and velocity that dies out as a cubic within the acceleration limits.
+    """An offset in position and velocity that decays to zero as a cubic within the acceleration limits.
 
-    Added to a motion it makes that motion start where the arm is now.
+    Added to a motion, it makes that motion start from the present command.
+
+    Args:
+        q: (7,) initial position offset [rad].
+        dq: (7,) initial velocity offset [rad/s].
+        ddq_max: (7,) maximum accelerations [rad/s²].
     """
 
     def __init__(self, q: np.ndarray, dq: np.ndarray, ddq_max: np.ndarray) -> None:
-        # The cubic from (q, dq) to rest in T has its largest acceleration at an end: at most 6|q|/T² + 4|dq|/T.
+        # The cubic from (q, dq) to rest in T has its maximum acceleration at an end: at most 6|q|/T² + 4|dq|/T.
         v, a = np.abs(dq), ddq_max
         self.duration_s = float(((4 * v + np.sqrt(16 * v * v + 24 * a * np.abs(q))) / (2 * a)).max())
         self._q, self._dq = q, dq
 
     def at(self, t_s: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return what is left of the difference (7,) [rad] and its rate (7,) [rad/s] at `t_s` [s]."""
+        """Return the offset left (7,) [rad] and its rate (7,) [rad/s] at `t_s` [s]."""
         T = self.duration_s
         if t_s >= T:
             return np.zeros_like(self._q), np.zeros_like(self._q)

@@ -1,4 +1,12 @@
-"""One cycle of the servo: measure, choose the setpoint, limit it, send it, tell."""
+"""One cycle of the 500 Hz control loop: measure, check, choose the command, limit it, send it.
+
+    state = arm.read_state()                           faults, overload, blocked joints -> latch the stop
+    command = stop > trajectory > setpoint > hold      heartbeat late, underrun, guard -> brake
+    setpoint = clip_setpoint(command)                  joint limits, grip torque, step
+    arm.send(setpoint)
+
+Nothing in it blocks, logs or takes a lock. The motions themselves are in `setpoint_generator`, the stops in `braking`.
+"""
 
 from __future__ import annotations
 
@@ -8,20 +16,20 @@ from hal.base.arm import Arm
 from hal.base.errors import HalError
 from hal.base.messages import ArmSetpoint, ArmState, ServoMode
 from hal.base.z1 import N_ARM
-from hal.servo.command_mailbox import Orders, Snapshot
-from hal.servo.limits import OverloadWatch, ServoLimits, clip_setpoint, find_blocked, servo_torque
-from hal.servo.setpoint_generator import SetpointGenerator, Wish
-from hal.servo.trajectory_buffer import Playback
+from hal.servo.command_mailbox import CommandMailbox, Snapshot
+from hal.servo.limits import OverloadDetector, ServoLimits, clip_setpoint, compute_servo_torque, find_blocked
+from hal.servo.setpoint_generator import JointCommand, SetpointGenerator
+from hal.servo.trajectory_buffer import TrajectoryBuffer
 
 
-class Cycle:
-    """What the tick's thread alone does and knows; never blocks and never logs.
+class ControlCycle:
+    """The tick's private state and its steps; used by the tick's thread alone.
 
     Args:
-        arm: what is moved; connected.
-        limits: what is allowed.
-        orders: what the producers want; its guard checks each step towards a single setpoint.
-        state: the arm as measured now, which it holds at first.
+        arm: connected.
+        limits: of the setpoints.
+        mailbox: commands of the producers; its guard checks each step towards a single setpoint.
+        state: measurement of the arm, whose position is held at first.
         heartbeat_timeout_s: see `hal.servo.servo.Servo`.
         send_timeout_s: see `hal.servo.servo.Servo`.
     """
@@ -30,151 +38,164 @@ class Cycle:
         self,
         arm: Arm,
         limits: ServoLimits,
-        orders: Orders,
+        mailbox: CommandMailbox,
         state: ArmState,
         *,
         heartbeat_timeout_s: float | None,
         send_timeout_s: float,
     ) -> None:
-        self._arm, self._limits, self._orders = arm, limits, orders
+        self._arm, self._limits, self._mailbox = arm, limits, mailbox
         self._heartbeat_timeout_s, self._send_timeout_s = heartbeat_timeout_s, send_timeout_s
         self._motion = SetpointGenerator(limits, state.q)
-        self._overload = OverloadWatch(limits)
+        self._overload = OverloadDetector(limits)
         self._state, self._q_sent = state, state.q
-        self._link_lost = self._give_way = self._gave_way = False
-        self.clips = 0
-        """How many setpoints the limits have changed."""
+        self._link_lost = self._yield_pending = self._has_yielded = False
+        self.clipped_count = 0
+        """Number of setpoints that the limits have changed."""
 
     def run(self, now_s: float) -> Snapshot:
-        """Run one cycle; trajectory time moves on by exactly one control period, however late the call is."""
+        """Run one cycle; trajectory time advances by exactly one control period, however late the call is."""
         self._measure()
-        self._act(now_s)
+        self._command(now_s)
         return self.snapshot(now_s)
 
     def snapshot(self, now_s: float) -> Snapshot:
-        """Return what there is to tell."""
+        """Return the result of the last cycle for other threads."""
         motion = self._motion
-        # A stop may come in the middle of a tick: what still tracks is not stopped yet.
-        stopped = bool(self._orders.latch) and motion.mode is ServoMode.HOLDING
+        # A stop may arrive in the middle of a tick: an arm that still tracks is not stopped yet.
+        stopped = bool(self._mailbox.latch) and motion.mode is ServoMode.HOLDING
         return Snapshot(
             stamp_s=now_s,
             mode=ServoMode.STOPPED if stopped else motion.mode,
-            reason=self._orders.latch or motion.reason,
+            reason=self._mailbox.latch or motion.reason,
             trajectory_id=motion.trajectory_id,
-            time_s=max(motion.time_s, 0.0),
+            trajectory_time_s=max(motion.trajectory_time_s, 0.0),
             finished=motion.finished,
             q_sent=self._q_sent,
-            q_wanted=motion.q,
+            q_desired=motion.q,
             state=self._state,
         )
 
+    # --- Measure and check --------------------------------------------------------------------------------------
+
     def _measure(self) -> None:
+        """Read the arm; latch the stop at a lost state, a reported fault, an overload or a blocked joint."""
         try:
             state = self._arm.read_state()
         except HalError as error:
-            self._fault(f"the arm's state is lost: {error}")
+            self._latch_fault(f"the arm's state is lost: {error}")
             return
         self._state = state
         if state.faults:
-            self._fault(f"the arm reports {', '.join(state.faults)}")
+            self._latch_fault(f"the arm reports {', '.join(state.faults)}")
             return
-        overload = self._overload.update(state.tau, servo_torque(self._q_sent, state.q))
+        overload = self._overload.update(state.tau, compute_servo_torque(self._q_sent, state.q))
         blocked = overload or find_blocked(self._limits, self._q_sent, state.q)
         if blocked:
-            # Holding the command would go on pushing: once at rest, the arm holds what it measures instead. Only
-            # once until it is re-armed, lest a load that does not end pull it along.
-            if not self._gave_way:
-                self._give_way = self._gave_way = True
-            self._fault(blocked)
+            # Holding the command would go on pushing: once at rest, the arm holds its measured position instead. Only
+            # once until it is re-armed, so that a permanent load does not drag the arm along.
+            if not self._has_yielded:
+                self._yield_pending = self._has_yielded = True
+            self._latch_fault(blocked)
 
-    def _fault(self, reason: str) -> None:
-        """Latch, as `Servo.stop` does: somebody has to look at the arm before it moves again."""
-        orders = self._orders
-        if not orders.latch:
-            orders.cancel_reason = reason
-            orders.latch = reason
+    def _latch_fault(self, reason: str) -> None:
+        """Latch the stop, as `Servo.stop` does: an operator has to inspect the arm before it moves again."""
+        mailbox = self._mailbox
+        if not mailbox.latch:
+            mailbox.cancel_reason = reason
+            mailbox.latch = reason
 
-    def _act(self, now_s: float) -> None:
+    # --- Choose the command -------------------------------------------------------------------------------------
+
+    def _command(self, now_s: float) -> None:
         """Command the arm."""
-        self._command(*self._choose(now_s))
+        self._send_command(*self._select_command(now_s))
 
-    def _choose(self, now_s: float) -> Wish:
-        motion, orders = self._motion, self._orders
-        if orders.rearmed:
-            orders.rearmed = self._link_lost = self._gave_way = False
-            self._give_way, motion.reason = True, ""
-        if orders.done_id > motion.trajectory_id:
-            motion.skip(orders.done_id, orders.cancel_reason)
+    def _select_command(self, now_s: float) -> JointCommand:
+        """Return the command by priority: latched stop, trajectory, single setpoint, hold."""
+        motion, mailbox = self._motion, self._mailbox
+        if mailbox.rearm_pending:
+            mailbox.rearm_pending = self._link_lost = self._has_yielded = False
+            self._yield_pending, motion.reason = True, ""
+        if mailbox.finished_id > motion.trajectory_id:
+            motion.skip(mailbox.finished_id, mailbox.cancel_reason)
         # Read once: a producer may replace any of them while this runs.
-        newest, current, target = orders.playback, orders.current, orders.target
-        if orders.latch:
-            orders.finish(newest)
-            orders.target = None
+        newest, active, target = mailbox.trajectory, mailbox.active_trajectory, mailbox.target
+        if mailbox.latch:
+            mailbox.finish(newest)
+            mailbox.target = None
             if motion.mode is ServoMode.TRACKING:
-                motion.brake(orders.latch, newest)
-        elif current is not None:
-            return self._follow(current, now_s)
+                motion.brake(mailbox.latch, newest)
+        elif active is not None:
+            return self._follow_trajectory(active, now_s)
         elif target is not None and now_s - target.stamp_s <= self._send_timeout_s:
-            return self._chase(target.setpoint.q)
+            return self._track_target(target.setpoint.q)
         elif motion.mode is ServoMode.TRACKING:
-            motion.brake("" if target else orders.cancel_reason, newest)
-            orders.target = None
-        if self._give_way and motion.mode is ServoMode.HOLDING:
-            self._give_way = False
-            motion.give_way(self._state.q)
-        return motion.rest()
+            motion.brake("" if target else mailbox.cancel_reason, newest)
+            mailbox.target = None
+        if self._yield_pending and motion.mode is ServoMode.HOLDING:
+            self._yield_pending = False
+            motion.yield_to_measured(self._state.q)
+        return motion.brake_or_hold()
 
-    def _follow(self, current: Playback, now_s: float) -> Wish:
-        motion, orders = self._motion, self._orders
-        if current.trajectory_id != motion.trajectory_id:
-            motion.begin(current)
-        why = self._lateness(now_s) or orders.dead_end.get(current.trajectory_id, "")
-        if why or motion.runs_dry(current):
-            orders.finish(current)
-            motion.brake(why or f"trajectory {current.trajectory_id} ran dry at {current.end_s:.3f} s", current)
-            return motion.rest()
-        wish = motion.play(current)
+    def _follow_trajectory(self, active: TrajectoryBuffer, now_s: float) -> JointCommand:
+        """Play the active trajectory; brake on its path at a late heartbeat, a blocked chunk or an underrun."""
+        motion, mailbox = self._motion, self._mailbox
+        if active.trajectory_id != motion.trajectory_id:
+            motion.begin(active)
+        reason = self._heartbeat_fault(now_s) or mailbox.blocked_trajectories.get(active.trajectory_id, "")
+        if reason or motion.has_underrun(active):
+            mailbox.finish(active)
+            reason = reason or f"trajectory {active.trajectory_id}: buffer underrun at {active.end_s:.3f} s"
+            motion.brake(reason, active)
+            return motion.brake_or_hold()
+        command = motion.play(active)
         if motion.finished:
-            orders.finish(current)
-        return wish
+            mailbox.finish(active)
+        return command
 
-    def _chase(self, q_target: np.ndarray) -> Wish:
-        """Move towards a setpoint; brake where going on could no longer be stopped inside the guard's space."""
-        motion, guard = self._motion, self._orders.guard
-        wish = motion.chase(q_target)
+    def _track_target(self, q_target: np.ndarray) -> JointCommand:
+        """Move towards a setpoint; brake while a stop still ends inside the guard's workspace."""
+        motion, guard = self._motion, self._mailbox.guard
+        command = motion.track(q_target)
         if guard is not None:
-            ahead = np.array([wish[0], motion.find_rest()])
-            if refusal := guard.refusal(ahead, self._q_sent):
-                self._orders.target = None
-                motion.brake(f"the way to the setpoint {refusal[1]}")
-                return motion.rest()
-        return wish
+            ahead = np.array([command.q, motion.predict_rest_position()])
+            if violation := guard.find_violation(ahead, self._q_sent):
+                self._mailbox.target = None
+                motion.brake(f"guard: the motion to the setpoint {violation.text}")
+                return motion.brake_or_hold()
+        return command
 
-    def _lateness(self, now_s: float) -> str:
-        lease, allowed_s = self._orders.lease, self._heartbeat_timeout_s
-        silent_s = now_s - lease.beat_s
+    def _heartbeat_fault(self, now_s: float) -> str:
+        """Return a description of a late heartbeat; empty when it is in time or not required."""
+        lease, allowed_s = self._mailbox.lease, self._heartbeat_timeout_s
+        silent_s = now_s - lease.last_heartbeat_s
         if allowed_s is None or silent_s <= allowed_s:
             return ""
         return f"no heartbeat from {lease.owner!r} for {silent_s:.3f} s (allowed {allowed_s} s)"
 
-    def _command(self, q: np.ndarray, dq: np.ndarray) -> None:
+    # --- Limit and send -----------------------------------------------------------------------------------------
+
+    def _send_command(self, q: np.ndarray, dq: np.ndarray) -> None:
+        """Clip the command, record it as the start of the next one, and send it unless the link is lost."""
         state = self._state
         allowed = clip_setpoint(self._limits, q, dq, q_last=self._q_sent, q_measured=state.q, dq_measured=state.dq)
-        self.clips += allowed.clipped
-        noted = np.minimum(np.maximum(q, self._limits.q_min), self._limits.q_max)
-        noted[:N_ARM] = allowed.q[:N_ARM]
-        self._motion.take_note(noted, np.append(allowed.dq[:N_ARM], dq[N_ARM]))
+        self.clipped_count += allowed.clipped
+        # The gripper's squeeze limit is left out of the record: the next motion starts from the grip as commanded.
+        recorded = np.minimum(np.maximum(q, self._limits.q_min), self._limits.q_max)
+        recorded[:N_ARM] = allowed.q[:N_ARM]
+        self._motion.update_last_command(recorded, np.append(allowed.dq[:N_ARM], dq[N_ARM]))
         if self._link_lost:
             return
         try:
             self._q_sent = self._arm.send(ArmSetpoint(q=allowed.q, dq=allowed.dq)).q
         except HalError as error:
-            self._fault(f"the arm takes no commands: {error}")
+            self._latch_fault(f"the arm takes no commands: {error}")
             self._link_lost = True
 
 
-class WatchingCycle(Cycle):
-    """A cycle that commands nothing: what the arm does is what it was told."""
+class MonitorOnlyCycle(ControlCycle):
+    """A cycle that commands nothing: the reported command is the measurement."""
 
-    def _act(self, now_s: float) -> None:
+    def _command(self, now_s: float) -> None:
         self._q_sent = self._motion.q = self._state.q

@@ -1,4 +1,4 @@
-"""The arithmetic of the guard, compiled."""
+"""Margins of the safety guard, compiled by Numba."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ _LINK = np.array([_LINKS.index(capsule.link) for capsule in CAPSULES])
 _ENDS = np.array([(capsule.start, capsule.end) for capsule in CAPSULES])
 _RADII = np.array([capsule.radius_m for capsule in CAPSULES])
 _MAY_MEET_TABLE = np.array([capsule.link in TABLE_LINKS for capsule in CAPSULES])
-_MAY_MEET_HAND = np.array([capsule.link in GRIPPER_OBSTACLES for capsule in CAPSULES])
+_MAY_MEET_GRIPPER = np.array([capsule.link in GRIPPER_OBSTACLES for capsule in CAPSULES])
 AXES = "ZYYYZX"
-"""About which axis of its own each arm joint turns."""
+"""Rotation axis of each arm joint in its own frame."""
 _AXIS = np.array(["XYZ".index(axis) for axis in AXES])
 
 
@@ -74,20 +74,20 @@ def segment_distance(a, b, c, d):
 
 @njit(cache=True, nogil=True)
 def measure_margins(q, joints, lower, upper, T_flange_pivot):
-    """Return how far postures stay inside, three (N,) arrays [m]: of the box, above z = 0, of the arm itself.
+    """Return the margins of postures, three (N,) arrays [m]: to the box, above z = 0, between links of the arm.
 
     Args:
-        q: (N, 7) postures [rad], writable: a read-only array is another type, for which all would be compiled anew.
+        q: (N, 7) postures [rad], writable: a read-only array is another type, which would be compiled again.
         joints: (6, 4, 4) each arm joint's frame in its parent link at angle 0.
         lower: (3,) lower corner of the box, base frame [m].
         upper: (3,) its upper corner [m].
-        T_flange_pivot: (4, 4) the mover's hinge.
+        T_flange_pivot: (4, 4) pose of the moving jaw's hinge.
     """
     n = len(q)
     box, table, own = np.full(n, np.inf), np.full(n, np.inf), np.full(n, np.inf)
     links, unmoved = np.zeros((7, 4, 4)), np.eye(4)
     links[0] = unmoved
-    pivot, mover = np.empty((4, 4)), np.empty((4, 4))
+    pivot, moving_jaw = np.empty((4, 4)), np.empty((4, 4))
     ends, point = np.empty((len(_RADII), 2, 3)), np.empty(3)
     for k in range(n):
         for j in range(6):
@@ -102,16 +102,16 @@ def measure_margins(q, joints, lower, upper, T_flange_pivot):
             gap = segment_distance(ends[one, 0], ends[one, 1], ends[other, 0], ends[other, 1])
             own[k] = min(own[k], gap - _RADII[one] - _RADII[other])
         _chain(links[6], T_flange_pivot, 1, 0.0, pivot)
-        _chain(pivot, unmoved, 1, q[k, 6], mover)
+        _chain(pivot, unmoved, 1, q[k, 6], moving_jaw)
         for i in range(len(GRIPPER_POINTS) + len(MOVING_JAW_POINTS)):
             if i < len(GRIPPER_POINTS):
                 _apply(pivot, GRIPPER_POINTS[i], point)
             else:
-                _apply(mover, MOVING_JAW_POINTS[i - len(GRIPPER_POINTS)], point)
+                _apply(moving_jaw, MOVING_JAW_POINTS[i - len(GRIPPER_POINTS)], point)
             table[k] = min(table[k], point[2])
             for a in range(3):
                 box[k] = min(box[k], point[a] - lower[a], upper[a] - point[a])
             for c in range(len(_RADII)):
-                if _MAY_MEET_HAND[c]:
+                if _MAY_MEET_GRIPPER[c]:
                     own[k] = min(own[k], np.sqrt(squared_distance(point, ends[c, 0], ends[c, 1])) - _RADII[c])
     return box, table, own

@@ -1,4 +1,4 @@
-"""Who may command the arm: one owner at a time, who has to show that he is alive."""
+"""Command lease: exclusive ownership of the arm, renewed by heartbeat."""
 
 from __future__ import annotations
 
@@ -6,50 +6,56 @@ from hal.base.errors import LeaseError
 
 
 class Lease:
-    """The command lease.
+    """The command lease of one arm.
 
     Args:
-        timeout_s: with the arm at rest, a lease silent for so long [s] has lapsed: others may claim it, and until
-            one does its owner revives it by being heard again. None = never.
+        timeout_s: with the arm at rest, a lease without a heartbeat for so long [s] lapses: another client may claim
+            it, and until then the owner revives it by its next heartbeat. None = it never lapses.
     """
 
     def __init__(self, timeout_s: float | None) -> None:
         self._timeout_s = timeout_s
         self.owner = ""
-        """The last one who claimed it and has not released it; empty when nobody."""
-        self.beat_s = 0.0
-        """When he was last heard [s]."""
+        """The client that claimed last and has not released; empty when free."""
+        self.last_heartbeat_s = 0.0
+        """Time of the owner's last heartbeat [s]."""
 
-    def holder(self, now_s: float, *, at_rest: bool) -> str:
-        """Return who holds it at `now_s` [s]; empty when nobody does or it has lapsed."""
-        lapsed = self._timeout_s is not None and at_rest and now_s - self.beat_s > self._timeout_s
+    def current_owner(self, now_s: float, *, at_rest: bool) -> str:
+        """Return the owner at `now_s` [s]; empty when the lease is free or has lapsed."""
+        lapsed = self._timeout_s is not None and at_rest and now_s - self.last_heartbeat_s > self._timeout_s
         return "" if lapsed else self.owner
 
     def claim(self, owner: str, now_s: float, *, at_rest: bool) -> None:
-        """Take it.
+        """Claim the lease.
 
         Raises:
-            LeaseError: the name is empty, or somebody else holds it.
+            LeaseError: the name is empty (`empty_owner`), or another client owns the lease (`owned_by_other`).
         """
         if not owner:
-            raise LeaseError("the owner of a lease needs a name that is not empty.")
-        holder = self.holder(now_s, at_rest=at_rest)
-        if holder not in ("", owner):
-            raise LeaseError(f"the arm is commanded by {holder!r}; {owner!r} has to wait until that one releases it.")
-        self.owner, self.beat_s = owner, now_s
+            raise LeaseError("lease: the owner's name is empty. Claim it with a name.", code="empty_owner")
+        current = self.current_owner(now_s, at_rest=at_rest)
+        if current not in ("", owner):
+            raise LeaseError(
+                f"lease: the arm is commanded by {current!r}, so {owner!r} cannot claim it. Wait for its release.",
+                code="owned_by_other",
+            )
+        self.owner, self.last_heartbeat_s = owner, now_s
 
-    def beat(self, owner: str | None, now_s: float) -> None:
-        """The owner (None = whoever holds it) was heard at `now_s` [s].
+    def renew(self, owner: str | None, now_s: float) -> None:
+        """Record a heartbeat of `owner` (None = the current one) at `now_s` [s].
 
         Raises:
-            LeaseError: nobody, or somebody else, holds it.
+            LeaseError: the lease is free (`not_claimed`), or another client owns it (`owned_by_other`).
         """
         if not self.owner:
-            raise LeaseError("nobody holds the arm's lease; claim() it first.")
+            raise LeaseError("lease: the arm has no owner. Call claim() first.", code="not_claimed")
         if owner not in (None, self.owner):
-            raise LeaseError(f"the arm is commanded by {self.owner!r}, not by {owner!r}; claim() it first.")
-        self.beat_s = now_s
+            raise LeaseError(
+                f"lease: the arm is commanded by {self.owner!r}, not by {owner!r}. Call claim() first.",
+                code="owned_by_other",
+            )
+        self.last_heartbeat_s = now_s
 
     def clear(self) -> None:
-        """Nobody holds it."""
+        """Free the lease."""
         self.owner = ""

@@ -1,4 +1,4 @@
-"""What the servo lets through to the arm: joint limits, speed, grip torque, and what counts as blocked."""
+"""Limits between the servo and the arm: joint positions, speed, grip torque, and detection of blocked joints."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from hal.base.errors import InvalidMessageError
 from hal.base.messages import frozen_array
 
 _GRIPPER = z1.N_ARM
-_MEASURED = 0
+_MEASURED = 0  # row of `OverloadDetector._levels`
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -20,55 +20,61 @@ class ServoLimits:
     """Limits of the servo; the defaults are the Z1's (`hal.base.z1`)."""
 
     q_min: np.ndarray = field(default_factory=lambda: z1.Q_MIN)
-    """(7,) lowest joint position [rad]."""
+    """(7,) minimum joint positions [rad]."""
     q_max: np.ndarray = field(default_factory=lambda: z1.Q_MAX)
-    """(7,) highest joint position [rad]."""
+    """(7,) maximum joint positions [rad]."""
     dq_max: np.ndarray = field(default_factory=lambda: z1.DQ_MAX)
-    """(7,) highest joint speed [rad/s]."""
+    """(7,) maximum joint speeds [rad/s]."""
     ddq_max: np.ndarray = field(default_factory=lambda: z1.DDQ_MAX)
-    """(7,) joint acceleration used for braking and blending [rad/s²]."""
+    """(7,) maximum joint accelerations, also for braking and blending [rad/s²]."""
     dddq_max: np.ndarray = field(default_factory=lambda: z1.DDDQ_MAX)
-    """(7,) joint jerk used for braking [rad/s³]."""
+    """(7,) maximum joint jerks, also for braking [rad/s³]."""
     tau_max: np.ndarray = field(default_factory=lambda: z1.TAU_MAX)
-    """(7,) highest motor torque [Nm]."""
+    """(7,) maximum motor torques [Nm]."""
     grip_torque_nm: float = 3.0
-    """The gripper's command leads its measurement by no more than this torque divided by its stiffness [Nm]."""
+    """The gripper's command leads its measurement by at most this torque divided by its stiffness [Nm]."""
     gripper_lag_s: float = 0.03
-    """A jaw that moves is led by as much more as it goes in this time, since it is heard of that late [s]. Without it a
-    late arm's jaw would crawl, and close after the hand has turned. Where it is held up, it does not move."""
+    """Latency of the gripper's measurement [s]: a jaw in motion may be led by the distance it covers in this time as
+    well. Without it the jaw of a slow link would crawl, and close after the gripper has turned. A blocked jaw does not
+    move and gets no extra lead."""
     start_error_rad: float = 0.05
-    """How far the first point of a trajectory may be from the arm [rad]."""
+    """Maximum distance of a trajectory's first point from the arm, per joint [rad]."""
     following_error_rad: float = 0.3
-    """An arm joint further than this from its command is blocked [rad]."""
+    """An arm joint further than this from its command counts as blocked [rad]."""
     overload_fraction: float = 0.98
-    """A motor above this part of `tau_max` for `overload_s` is overloaded, and so is one asked for all of it."""
+    """A motor above this ratio of `tau_max` for `overload_s` is overloaded, and so is one whose command asks for all of
+    `tau_max`."""
     overload_s: float = 0.1
     """See `overload_fraction` [s]."""
     brake_s: float = 0.24
-    """Braking takes no longer; when `ddq_max` cannot do that, it brakes harder [s]. With the 0.15 s after which an
-    owner counts as lost (`hal.process`), the command rests 0.4 s after the owner's last sign of life."""
+    """Maximum duration of braking; where `ddq_max` is too little for it, the servo brakes harder [s]. With the
+    heartbeat timeout of 0.15 s (`hal.process`) the command is at rest within 0.4 s of the owner's last heartbeat."""
 
     def __post_init__(self) -> None:
         for entry in fields(self):
             value = getattr(self, entry.name)
             if isinstance(value, (int, float)):
                 if not (np.isfinite(value) and value > 0):
-                    raise InvalidMessageError(f"ServoLimits.{entry.name} is {value}; it must be finite and above 0.")
+                    raise InvalidMessageError(
+                        f"ServoLimits.{entry.name} is {value}; it must be finite and above 0.", code="invalid_limit"
+                    )
             else:
                 object.__setattr__(self, entry.name, frozen_array(value, float, (z1.N_JOINTS,), entry.name))
         if (self.q_min >= self.q_max).any():
-            raise InvalidMessageError(f"ServoLimits.q_min {self.q_min} must be below q_max {self.q_max}.")
+            raise InvalidMessageError(
+                f"ServoLimits.q_min {self.q_min} must be below q_max {self.q_max}.", code="invalid_limit"
+            )
 
 
 class ClippedSetpoint(NamedTuple):
-    """What is left of a wish after the limits."""
+    """A desired setpoint after the limits."""
 
     q: np.ndarray
     """(7,) joint positions [rad]."""
     dq: np.ndarray
-    """(7,) joint velocities [rad/s]; 0 where the position wished lies outside the joint limits."""
+    """(7,) joint velocities [rad/s]; 0 where the desired position is outside the joint limits."""
     clipped: bool
-    """True when an arm joint could not have what was wished (a squeezing gripper is no exception)."""
+    """True when a limit changed an arm joint's position (a squeezing gripper is clipped by design)."""
 
 
 def clip_setpoint(
@@ -80,26 +86,26 @@ def clip_setpoint(
     q_measured: np.ndarray,
     dq_measured: np.ndarray,
 ) -> ClippedSetpoint:
-    """Return the setpoint nearest to `q` that the arm may have this tick.
+    """Return the setpoint nearest to `q` that the limits allow this tick.
 
     In this order: joint positions; the gripper's lead over its measurement, so that |K_P (q − q_measured)| stays
-    within the grip torque once the jaw rests (a grasp squeezes with a bounded force, whatever it was told); the step
-    from `q_last`, so that no joint is ever asked for more than `dq_max`. The step comes last because it protects the
-    motors.
+    within the grip torque once the jaw is at rest (a grasp squeezes with a bounded force, whatever its command); the
+    step from `q_last`, so that no joint exceeds `dq_max`. The step comes last because it protects the motors.
 
     Args:
         limits: the limits.
-        q: (7,) wished positions [rad].
-        dq: (7,) wished velocities [rad/s].
+        q: (7,) desired positions [rad].
+        dq: (7,) desired velocities [rad/s].
         q_last: (7,) setpoint of the tick before [rad].
-        q_measured: (7,) newest measurement [rad].
-        dq_measured: (7,) the same of the velocities [rad/s].
+        q_measured: (7,) newest measured positions [rad].
+        dq_measured: (7,) newest measured velocities [rad/s].
     """
     allowed = np.minimum(np.maximum(q, limits.q_min), limits.q_max)
     velocity = np.minimum(np.maximum(dq, -limits.dq_max), limits.dq_max)
-    # Position servos add their damping times this speed: at a limit it would push beyond it.
+    # The motors' servos add damping times this speed: at a position limit it would push beyond it.
     velocity[allowed != q] = 0.0
     lead_rad = limits.grip_torque_nm / z1.KP[_GRIPPER]
+    # A measured speed beyond the joint's own is an error of measurement and must not extend the lead.
     on_rad = min(max(dq_measured[_GRIPPER], -limits.dq_max[_GRIPPER]), limits.dq_max[_GRIPPER]) * limits.gripper_lag_s
     low, high = q_measured[_GRIPPER] - lead_rad + min(on_rad, 0.0), q_measured[_GRIPPER] + lead_rad + max(on_rad, 0.0)
     grip = min(max(allowed[_GRIPPER], low), high)
@@ -108,24 +114,24 @@ def clip_setpoint(
         velocity[_GRIPPER] = 0.0
     step = limits.dq_max * z1.CONTROL_PERIOD_S
     allowed = np.minimum(np.maximum(allowed, q_last - step), q_last + step)
-    clipped = bool((np.abs(allowed - q)[:_GRIPPER] > 1e-9).any())
+    clipped = bool((np.abs(allowed - q)[:_GRIPPER] > 1e-9).any())  # 1e-9 rad: rounding of the step
     return ClippedSetpoint(allowed, velocity, clipped)
 
 
 def find_blocked(limits: ServoLimits, q_command: np.ndarray, q_measured: np.ndarray) -> str:
-    """Say which arm joint does not follow its command; empty when all do."""
+    """Return a description of the arm joint that does not follow its command; empty when all do."""
     error = np.abs(q_command - q_measured)[:_GRIPPER]
     if error.max() <= limits.following_error_rad:
         return ""
     worst = int(error.argmax())
     return (
         f"{z1.JOINT_NAMES[worst]} is {error[worst]:.2f} rad from its command (allowed "
-        f"{limits.following_error_rad:.2f}): it is blocked or has hit something"
+        f"{limits.following_error_rad:.2f}): it is blocked or in collision"
     )
 
 
-class OverloadWatch:
-    """Counts how long a motor has been at its torque limit, or asked for more than that."""
+class OverloadDetector:
+    """A counter of the ticks that each motor spends at its torque limit, or with a command that asks for more."""
 
     def __init__(self, limits: ServoLimits) -> None:
         tau_max = limits.tau_max[:_GRIPPER]
@@ -133,16 +139,16 @@ class OverloadWatch:
         self._allowed_ticks = round(limits.overload_s / z1.CONTROL_PERIOD_S)
         self._ticks = np.zeros(self._levels.shape, dtype=int)
 
-    def update(self, tau: np.ndarray, asked: np.ndarray) -> str:
-        """Take this tick's torques; say which arm joint is overloaded, empty when none is.
+    def update(self, tau: np.ndarray, requested: np.ndarray) -> str:
+        """Count this tick's torques; return a description of the overloaded arm joint, empty when none is.
 
-        The gripper is left out: it is meant to push for as long as it holds something.
+        The gripper is left out: it pushes for as long as it holds an object.
 
         Args:
-            tau: (7,) measured [Nm].
-            asked: (7,) what the position servos make of the command [Nm] (`servo_torque`).
+            tau: (7,) measured torques [Nm].
+            requested: (7,) torques that the position servos compute from the command [Nm] (`compute_servo_torque`).
         """
-        over = np.abs(np.stack([tau[:_GRIPPER], asked[:_GRIPPER]])) >= self._levels
+        over = np.abs(np.stack([tau[:_GRIPPER], requested[:_GRIPPER]])) >= self._levels
         if not over.any():
             self._ticks[:] = 0
             return ""
@@ -155,10 +161,10 @@ class OverloadWatch:
         if kind == _MEASURED:
             what = f"has been at its torque limit ({tau[joint]:.1f} Nm of {allowed_nm:.1f})"
         else:
-            what = f"does not follow: its command has asked for {asked[joint]:.1f} Nm (allowed {allowed_nm:.1f})"
+            what = f"does not follow: its command has asked for {requested[joint]:.1f} Nm (allowed {allowed_nm:.1f})"
         return f"{z1.JOINT_NAMES[joint]} {what} for more than {allowed_s:.2f} s: it is blocked, overloaded or lost"
 
 
-def servo_torque(q_command: np.ndarray, q_measured: np.ndarray) -> np.ndarray:
-    """Return the torques (7,) [Nm] that the arm's position servos make of a command (7,) [rad] beside gravity's."""
+def compute_servo_torque(q_command: np.ndarray, q_measured: np.ndarray) -> np.ndarray:
+    """Return the torques (7,) [Nm] of the arm's position servos for a command (7,) [rad], without gravity's."""
     return z1.KP * (q_command - q_measured)

@@ -1,33 +1,38 @@
-"""A servo that only watches: it measures and tells, and commands nothing, whoever asks."""
+"""Monitor-only servo: measures and publishes, and sends nothing to the arm."""
 
 from __future__ import annotations
 
 from hal.base.errors import CommandRejectedError, LeaseError
-from hal.servo.control_loop import WatchingCycle
+from hal.servo.control_loop import MonitorOnlyCycle
 from hal.servo.servo import Servo
 
-_WHY = "this HAL only watches (--readonly) and commands nothing"
+_MONITOR_ONLY = "servo: this HAL runs monitor-only (--readonly)"
 
 
-class ReadonlyServo(Servo):
-    """A servo whose ticks measure, publish, and no more. What the arm reports latches as usual, and is told."""
+class MonitorOnlyServo(Servo):
+    """A servo whose ticks measure and publish only. Faults of the arm latch and are reported as usual."""
 
-    cycle_type = WatchingCycle
+    cycle_type = MonitorOnlyCycle
 
     def claim(self, owner: str) -> None:
-        """Refuse.
+        """Reject every claim.
 
         Raises:
-            LeaseError: always.
+            LeaseError: always (`monitor_only`).
         """
-        raise LeaseError(f"{_WHY}; {owner!r} cannot have the arm. Start it again without --readonly to move it.")
+        raise LeaseError(
+            f"{_MONITOR_ONLY}: {owner!r} cannot claim the arm. Start it again without --readonly to move it.",
+            code="monitor_only",
+        )
 
     def stop(self, reason: str = "stop requested") -> None:
-        """Refuse: whoever moves the arm, it is not this servo.
+        """Reject a stop: another program moves the arm, which this servo cannot brake.
 
         Raises:
-            CommandRejectedError: always.
+            CommandRejectedError: always (`monitor_only`).
         """
         raise CommandRejectedError(
-            f"{_WHY}, so it cannot stop the arm ({reason}): stop whoever moves it, or use the switch on the arm."
+            f"{_MONITOR_ONLY}: it cannot stop the arm ({reason}). Stop the program that moves it, or use the switch on "
+            f"the arm.",
+            code="monitor_only",
         )

@@ -1,8 +1,12 @@
 """The 500 Hz servo above any arm: plays trajectories, enforces limits, brakes, holds, and latches the stop.
 
-Threads: one thread (or the lock-step clock) calls `tick`; any thread may call the rest. The tick takes no lock: what
-producers ask for waits in `hal.servo.command_mailbox.Orders`, what the tick tells them is one immutable snapshot a
-tick.
+Data flow between the producers' threads (left) and the tick's thread (right):
+
+    stream, send, stop, ...  ->  CommandMailbox  ->  ControlCycle  ->  arm
+    status, read_state       <-  Snapshot        <-
+
+One thread (or the lock-step clock) calls `tick`; any thread may call the rest. The tick takes no lock: it reads the
+mailbox's immutable entries, and publishes one immutable snapshot.
 """
 
 from __future__ import annotations
@@ -11,33 +15,33 @@ from hal.base.arm import Arm
 from hal.base.clock import Clock
 from hal.base.errors import CommandRejectedError, HalError, HalTimeoutError, NotConnectedError
 from hal.base.messages import ArmSetpoint, ArmState, ServoHealth, ServoMode, ServoStatus, TrajectoryChunk
-from hal.servo.command_mailbox import Orders, Snapshot
-from hal.servo.control_loop import Cycle
+from hal.servo.command_mailbox import CommandMailbox, Snapshot
+from hal.servo.control_loop import ControlCycle
 from hal.servo.guard import Guard
 from hal.servo.limits import ServoLimits, clip_setpoint
 from hal.servo.periods import PeriodStatistics
-from hal.servo.status import Teller, make_health, make_status
+from hal.servo.status import StatusLogger, make_health, make_status
 
-_STATE_MAX_AGE_S = 0.2
+_STATE_MAX_AGE_S = 0.2  # 100 ticks; `BusConfig.state_max_age_s` is the same for clients
 
 
 class Servo:
-    """An arm that takes trajectories (`hal.base.arm.ServoedArm`). What a tick does is in `hal.servo.control_loop`.
+    """An arm that takes trajectories (`hal.base.arm.ServoedArm`). The steps of a tick are in `hal.servo.control_loop`.
 
     Args:
-        arm: what is moved.
-        clock: what time it is; never slept on here.
-        limits: what is allowed.
-        heartbeat_timeout_s: how long the lease's owner may be silent while a trajectory plays [s]. A heartbeat is
-            any of `claim`, `stream`, `send`, `heartbeat`. None when the owner lives in this process and cannot be
-            lost without the servo; the lease then never lapses.
-        lease_timeout_s: with the arm at rest, a lease silent for so long [s] may be claimed by another.
-        send_timeout_s: how long a single setpoint is followed [s].
-        guard: keeps the arm above the table, in its workspace and off itself; None leaves the joint limits alone.
+        arm: the arm below.
+        clock: source of time stamps; never slept on here.
+        limits: of the setpoints; None = the Z1's.
+        heartbeat_timeout_s: maximum time without a heartbeat of the lease's owner while a trajectory plays [s]. Each
+            of `claim`, `stream`, `send` and `heartbeat` counts as one. None when the owner runs in this process and
+            cannot be lost without the servo; the lease then never lapses.
+        lease_timeout_s: with the arm at rest, another client may claim a lease without a heartbeat for so long [s].
+        send_timeout_s: how long a single setpoint is tracked [s].
+        guard: keeps the arm above the table, in its workspace and off itself; None checks only the joint limits.
     """
 
-    cycle_type: type[Cycle] = Cycle
-    """What a tick does."""
+    cycle_type: type[ControlCycle] = ControlCycle
+    """The steps of a tick."""
 
     def __init__(
         self,
@@ -55,14 +59,14 @@ class Servo:
         self.limits = limits or ServoLimits()
         self.periods = PeriodStatistics()
         self.real_time: tuple[str, ...] = ()
-        """What the thread that ticks was granted, for `health`."""
+        """Real-time resources granted to the thread that ticks, for `health`."""
         self._heartbeat_timeout_s = heartbeat_timeout_s
         self._send_timeout_s = send_timeout_s
-        self._orders = Orders(self.limits, None if heartbeat_timeout_s is None else lease_timeout_s, guard)
+        self._mailbox = CommandMailbox(self.limits, None if heartbeat_timeout_s is None else lease_timeout_s, guard)
         self._snapshot: Snapshot | None = None  # replaced by the tick
         self._ticked = False
 
-    # --- Life -----------------------------------------------------------------------------------------------
+    # --- Connection -----------------------------------------------------------------------------------------
 
     def connect(self) -> None:
         """Connect the arm and hold it where it is; the lease is free and no stop is latched.
@@ -78,26 +82,26 @@ class Servo:
         except HalError:
             self.arm.disconnect()
             raise
-        self._orders.reset()
-        self._teller, self._ticked = Teller(), False
+        self._mailbox.reset()
+        self._status_log, self._ticked = StatusLogger(), False
         self._cycle = self.cycle_type(
             self.arm,
             self.limits,
-            self._orders,
+            self._mailbox,
             state,
             heartbeat_timeout_s=self._heartbeat_timeout_s,
             send_timeout_s=self._send_timeout_s,
         )
         self._snapshot = self._cycle.snapshot(self.clock.now_s())
 
-    def keep_inside(self, guard: Guard) -> None:
-        """Let `guard` check whatever is commanded from now on; for before anything ticks."""
-        self._orders.guard = guard
+    def set_safety_guard(self, guard: Guard) -> None:
+        """Check all further commands by `guard`; call it before the first tick."""
+        self._mailbox.guard = guard
 
     def disconnect(self) -> None:
-        """Let go of the arm, which holds where it is. Brake first (`stop`) if it moves; end a `ServoThread` first."""
+        """Disconnect the arm, which holds its position. Brake first (`stop`) if it moves; end a `ServoThread` first."""
         self._snapshot = None
-        self._orders.lease.clear()
+        self._mailbox.lease.clear()
         self.arm.disconnect()
 
     def _connected(self) -> Snapshot:
@@ -106,12 +110,12 @@ class Servo:
             raise NotConnectedError("the servo")
         return snapshot
 
-    # --- What anybody may call, from any thread ---------------------------------------------------------------
+    # --- Commands and queries, from any thread ----------------------------------------------------------------
 
     def read_state(self) -> ArmState:
-        """Return the measurement of the last tick; before the first tick, ask the arm.
+        """Return the measurement of the last tick; before the first tick, of the arm now.
 
-        Once something ticks, the arm belongs to that thread: a second one would drive it at the same time.
+        Once a thread ticks, only that thread may access the arm: two would interleave on its link.
 
         Raises:
             NotConnectedError: before `connect()`.
@@ -123,73 +127,80 @@ class Servo:
         age_s = self.clock.now_s() - snapshot.state.stamp_s
         if age_s > _STATE_MAX_AGE_S:
             raise HalTimeoutError(
-                f"the servo's newest measurement is {age_s:.2f} s old; allowed is {_STATE_MAX_AGE_S} s. "
-                f"Its ticks have ended or the arm is silent: look at the log."
+                f"servo: the newest measurement is {age_s:.2f} s old (allowed {_STATE_MAX_AGE_S} s). "
+                f"The ticks have ended or the arm is silent: check the log.",
+                code="stale_state",
             )
         return snapshot.state
 
     def claim(self, owner: str) -> None:
-        """Take the command lease (see `hal.base.arm.ServoedArm.claim`)."""
-        self._orders.claim(owner, self.clock.now_s(), at_rest=self._connected().at_rest)
+        """Claim the command lease (see `hal.base.arm.ServoedArm.claim`)."""
+        self._mailbox.claim(owner, self.clock.now_s(), at_rest=self._connected().at_rest)
 
     def release(self, owner: str | None = None) -> None:
-        """Give the lease back; a running motion is braked first. Harmless when not held (by `owner`)."""
-        self._orders.release(owner)
+        """Release the lease and brake a running motion. No effect when it is not owned (by `owner`)."""
+        self._mailbox.release(owner)
 
     def heartbeat(self, owner: str | None = None) -> None:
-        """Say that the lease's owner is alive.
+        """Record a heartbeat of the lease's owner.
 
         Raises:
-            LeaseError: `owner` does not hold the lease.
+            LeaseError: `owner` does not own the lease.
         """
-        self._orders.beat(owner, self.clock.now_s())
+        self._mailbox.renew(owner, self.clock.now_s())
 
     def stop(self, reason: str = "stop requested") -> None:
-        """Brake at the next tick, then hold; every command is refused until `rearm()`. Queued motion is dropped."""
-        self._orders.stop(reason)
+        """Brake at the next tick, then hold; all commands are rejected until `rearm()`. Queued motion is dropped."""
+        self._mailbox.stop(reason)
 
     def fail(self, reason: str) -> None:
-        """Latch and stop the arm itself: for a driver whose tick cannot go on."""
-        self._orders.stop(reason)
+        """Latch the stop and stop the arm itself; for a thread whose ticks cannot continue."""
+        self._mailbox.stop(reason)
         snapshot = self._snapshot
         if snapshot is not None:
             self._snapshot = snapshot._replace(mode=ServoMode.STOPPED, reason=reason)
             self.arm.stop()
 
     def rearm(self) -> None:
-        """Lift a latched stop; the arm holds where it is and the lease is free. No effect when not stopped."""
+        """Clear a latched stop; the arm holds its position and the lease is free. No effect when not stopped."""
         self._connected()
-        self._orders.rearm()
+        self._mailbox.rearm()
 
     def stream(self, chunk: TrajectoryChunk, owner: str | None = None) -> None:
-        """Queue a piece of a trajectory (see `hal.base.arm.ServoedArm.stream`).
+        """Queue a trajectory chunk (see `hal.base.arm.ServoedArm.stream`).
 
         Args:
-            chunk: the piece.
-            owner: who sends it; None = the holder of the lease, in this process.
+            chunk: the chunk.
+            owner: its sender; None = the owner of the lease, in this process.
 
         Raises:
-            NotConnectedError, StoppedError, LeaseError, CommandRejectedError: it was not queued.
+            NotConnectedError, StoppedError, LeaseError, GuardError, CommandRejectedError: it was not queued; the codes
+                are those of `hal.servo.command_mailbox` and `hal.servo.trajectory_buffer`.
         """
         snapshot = self._connected()
         if not isinstance(chunk, TrajectoryChunk):
-            raise CommandRejectedError(f"stream() takes a TrajectoryChunk, not a {type(chunk).__name__}.")
-        self._orders.stream(chunk, owner, self.clock.now_s(), snapshot)
+            raise CommandRejectedError(
+                f"servo: stream() takes a TrajectoryChunk, not a {type(chunk).__name__}.", code="wrong_type"
+            )
+        self._mailbox.stream(chunk, owner, self.clock.now_s(), snapshot)
 
     def send(self, setpoint: ArmSetpoint, owner: str | None = None) -> ArmSetpoint:
-        """Move towards one setpoint within all limits; return it clipped to the joints' limits and a tick's reach.
+        """Move towards one setpoint within all limits; return it clipped to the joint limits and to one tick's step.
 
         Without another one within `send_timeout_s` the arm holds. For streams of setpoints at the servo's rate;
-        anything slower is smoother as a trajectory.
+        slower ones are smoother as a trajectory.
 
         Raises:
-            NotConnectedError, StoppedError, LeaseError: it was not taken.
-            CommandRejectedError: a trajectory is playing, or the guard forbids the place.
+            NotConnectedError, StoppedError, LeaseError: it was not accepted.
+            CommandRejectedError: a trajectory is playing.
+            GuardError: it is outside the workspace.
         """
         snapshot = self._connected()
         if not isinstance(setpoint, ArmSetpoint):
-            raise CommandRejectedError(f"send() takes an ArmSetpoint, not a {type(setpoint).__name__}.")
-        self._orders.send(setpoint, owner, self.clock.now_s(), snapshot)
+            raise CommandRejectedError(
+                f"servo: send() takes an ArmSetpoint, not a {type(setpoint).__name__}.", code="wrong_type"
+            )
+        self._mailbox.send(setpoint, owner, self.clock.now_s(), snapshot)
         allowed = clip_setpoint(
             self.limits,
             setpoint.q,
@@ -201,22 +212,24 @@ class Servo:
         return ArmSetpoint(q=allowed.q, dq=allowed.dq)
 
     def status(self) -> ServoStatus:
-        """Return the servo's account of its last tick; built on request, so that the tick need not."""
+        """Return the status after the last tick; built on request, to keep the tick short."""
         snapshot = self._connected()
         now_s = self.clock.now_s()
-        self._teller.tell(self._orders.latch, self._cycle.clips + self._orders.beyond, now_s)
-        return make_status(snapshot, self._orders, self.periods, now_s)
+        self._status_log.log_changes(
+            self._mailbox.latch, self._cycle.clipped_count + self._mailbox.out_of_limits_count, now_s
+        )
+        return make_status(snapshot, self._mailbox, self.periods, now_s)
 
     def health(self) -> ServoHealth:
-        """Return how well the servo does its work."""
-        return make_health(self._connected(), self._orders, self.periods, self.real_time, self.clock.now_s())
+        """Return the health: timing, faults and command authority."""
+        return make_health(self._connected(), self._mailbox, self.periods, self.real_time, self.clock.now_s())
 
     # --- The tick -----------------------------------------------------------------------------------------------
 
     def tick(self) -> None:
         """Run one cycle (`hal.servo.control_loop`). Never blocks and never logs.
 
-        Trajectory time moves on by exactly one control period a call, however late the call is.
+        Trajectory time advances by exactly one control period a call, however late the call is.
 
         Raises:
             NotConnectedError: before `connect()`.

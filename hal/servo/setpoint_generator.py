@@ -1,149 +1,164 @@
-"""The setpoint the servo wishes for each tick: playing, chasing, braking or holding, one joined to the next."""
+"""Setpoint generator: the joint command of each tick, from playing, tracking, braking or holding.
+
+Every change from one of these to another starts at the last command, so the command never jumps.
+"""
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 
 from hal.base.messages import ServoMode
 from hal.base.z1 import CONTROL_PERIOD_S, N_ARM, N_JOINTS
-from hal.servo.braking import Blend, Brake, Chaser, PathStop, StopPath, plan_path_stop
+from hal.servo.braking import Blend, Brake, JointStop, PathStop, TargetTracker, plan_path_stop
 from hal.servo.limits import ServoLimits
-from hal.servo.trajectory_buffer import Playback
+from hal.servo.trajectory_buffer import TrajectoryBuffer
 
-_AT_REST_RAD_S = 0.02
-_GIVE_WAY_RAD = 0.01
+_AT_REST_RAD_S = 0.02  # a trajectory whose last point is faster ends in motion and is braked
+_YIELD_THRESHOLD_RAD = 0.01  # below it the difference to the measurement is the servo's ordinary tracking error
 _ON_PATH_RAD = 1e-6
 _ZERO = np.zeros(N_JOINTS)
 _ZERO.setflags(write=False)
 
-Wish = tuple[np.ndarray, np.ndarray]
-"""Positions (7,) [rad] and velocities (7,) [rad/s], before the limits."""
+
+class JointCommand(NamedTuple):
+    """A desired setpoint of one tick, before the limits."""
+
+    q: np.ndarray
+    """(7,) positions [rad]."""
+    dq: np.ndarray
+    """(7,) velocities [rad/s]."""
 
 
 class SetpointGenerator:
-    """What the commanded joints do; used by the tick's thread alone. Every call that returns a wish is one tick.
+    """The state of the commanded motion; used by the tick's thread alone.
+
+    `begin`, `skip` and `brake` change the state. `play`, `track` and `brake_or_hold` return the command of one tick;
+    `update_last_command` then records it as the limits have changed it.
 
     Args:
         limits: for braking and blending.
-        q: (7,) where it holds at first [rad].
+        q: (7,) initial position to hold [rad].
     """
 
     def __init__(self, limits: ServoLimits, q: np.ndarray) -> None:
         self._limits = limits
         self._brake = Brake(limits)
-        self._chaser = Chaser(limits)
+        self._tracker = TargetTracker(limits)
         self.mode = ServoMode.HOLDING
         """HOLDING, TRACKING or BRAKING."""
         self.reason = ""
-        """Why it brakes or dropped the last trajectory."""
+        """Reason for braking or for dropping the last trajectory; empty when there is none."""
         self.trajectory_id = 0
-        """The last trajectory taken."""
-        self.time_s = 0.0
-        """How far it has been played [s]."""
+        """Last trajectory begun or skipped."""
+        self.trajectory_time_s = 0.0
+        """Time reached on that trajectory [s]."""
         self.finished = False
-        """Whether it was played to its end."""
+        """True when that trajectory was played to its end."""
         self.q = self._hold_q = q
-        """(7,) last position commanded [rad]; the arm after its limits, the gripper before its squeeze limit."""
+        """(7,) last commanded position [rad]: the arm's after its limits, the gripper's before its squeeze limit."""
         self._dq = self._ddq = _ZERO
-        # A difference of speeds lags by half a tick, which is enough to make a chase swing about its target.
-        self._chase_ddq: np.ndarray | None = None
-        self._stop_path: StopPath | PathStop | None = None
+        # The tracker's own acceleration: a difference of speeds lags by half a tick, enough to oscillate at the target.
+        self._tracked_ddq: np.ndarray | None = None
+        self._stop: JointStop | PathStop | None = None
         self._blend: Blend | None = None
-        self._since_s = 0.0  # ticks since the stop path or the blend began
+        self._since_s = 0.0  # since the stop or the blend began
 
-    def take_note(self, q: np.ndarray, dq: np.ndarray) -> None:
-        """The wish of this tick became position `q` (7,) [rad]; it was to move at `dq` (7,) [rad/s]."""
-        self._ddq = (dq - self._dq) / CONTROL_PERIOD_S if self._chase_ddq is None else self._chase_ddq
-        self._chase_ddq = None
+    def update_last_command(self, q: np.ndarray, dq: np.ndarray) -> None:
+        """Record the command after the limits: position `q` (7,) [rad] and velocity `dq` (7,) [rad/s]."""
+        self._ddq = (dq - self._dq) / CONTROL_PERIOD_S if self._tracked_ddq is None else self._tracked_ddq
+        self._tracked_ddq = None
         self.q, self._dq = q, dq
 
-    def begin(self, new: Playback) -> None:
-        """Change over to a new trajectory, wherever the arm is and however it moves."""
-        self.trajectory_id, self.time_s = new.trajectory_id, -CONTROL_PERIOD_S
+    def begin(self, new: TrajectoryBuffer) -> None:
+        """Change over to a new trajectory from any state, by a blend."""
+        self.trajectory_id, self.trajectory_time_s = new.trajectory_id, -CONTROL_PERIOD_S
         self.mode, self.reason, self.finished = ServoMode.TRACKING, "", False
-        self._join(*new.at(0.0))
+        self._start_blend(*new.at(0.0))
 
     def skip(self, trajectory_id: int, reason: str) -> None:
-        """Count a trajectory as taken and dropped: it was cancelled before its first tick."""
-        self.trajectory_id, self.time_s, self.finished, self.reason = trajectory_id, 0.0, False, reason
+        """Count a trajectory as begun and dropped: it was cancelled before its first tick."""
+        self.trajectory_id, self.trajectory_time_s, self.finished, self.reason = trajectory_id, 0.0, False, reason
 
-    def runs_dry(self, current: Playback) -> bool:
-        """Whether the buffer of a trajectory that is not complete ends before this tick."""
-        return not current.final and self.time_s + CONTROL_PERIOD_S > current.end_s + 1e-9
+    def has_underrun(self, active: TrajectoryBuffer) -> bool:
+        """Return True when the buffer of an incomplete trajectory ends before this tick."""
+        return not active.final and self.trajectory_time_s + CONTROL_PERIOD_S > active.end_s + 1e-9
 
-    def play(self, current: Playback) -> Wish:
-        """Move on by exactly one control period; at the end of a complete trajectory set `finished`."""
+    def play(self, active: TrajectoryBuffer) -> JointCommand:
+        """Advance by exactly one control period; at the end of a complete trajectory set `finished`."""
         # The end may come before a blend into the trajectory is over.
-        self.time_s = min(self.time_s + CONTROL_PERIOD_S, current.end_s)
-        q, dq = self._blended(*current.at(self.time_s))
-        if current.final and self.time_s >= current.end_s - 1e-9 and self._blend is None:
+        self.trajectory_time_s = min(self.trajectory_time_s + CONTROL_PERIOD_S, active.end_s)
+        q, dq = self._apply_blend(*active.at(self.trajectory_time_s))
+        if active.final and self.trajectory_time_s >= active.end_s - 1e-9 and self._blend is None:
             self.finished = True
             if np.abs(dq).max() > _AT_REST_RAD_S:
-                self.brake(f"trajectory {current.trajectory_id} ended in motion")
-                return self.rest()
+                self.brake(f"trajectory {active.trajectory_id} ended in motion")
+                return self.brake_or_hold()
             self.mode, self._hold_q = ServoMode.HOLDING, q
-            return q, _ZERO
-        return q, dq
+            return JointCommand(q, _ZERO)
+        return JointCommand(q, dq)
 
-    def chase(self, q: np.ndarray) -> Wish:
-        """Move towards `q` (7,) [rad] within the limits of speed, acceleration and jerk."""
-        self.mode, self.reason, self._blend, self._stop_path = ServoMode.TRACKING, "", None, None
-        q, dq, self._chase_ddq = self._chaser.step(q, self.q, self._dq, self._ddq)
-        return q, dq
+    def track(self, q_target: np.ndarray) -> JointCommand:
+        """Move towards `q_target` (7,) [rad] within the limits of speed, acceleration and jerk."""
+        self.mode, self.reason, self._blend, self._stop = ServoMode.TRACKING, "", None, None
+        q, dq, self._tracked_ddq = self._tracker.step(q_target, self.q, self._dq, self._ddq)
+        return JointCommand(q, dq)
 
-    def find_rest(self) -> np.ndarray:
-        """Return where (7,) the joints would come to rest if they braked from the present command [rad]."""
-        path = self._brake.plan(self.q, self._dq, self._ddq)
-        return path.at(path.duration_s)[0]
+    def predict_rest_position(self) -> np.ndarray:
+        """Return the position (7,) [rad] of the joints after braking from the present command."""
+        stop = self._brake.plan(self.q, self._dq, self._ddq)
+        return stop.at(stop.duration_s)[0]
 
-    def brake(self, reason: str, along: Playback | None = None) -> None:
-        """Begin to stop from the present command: on the path `along`, if that is what is being played and enough of it
-        is left, else every joint by itself."""
+    def brake(self, reason: str, along: TrajectoryBuffer | None = None) -> None:
+        """Begin to stop from the present command: on the path `along` where it is being played and enough of it is
+        buffered, else every joint by itself."""
         stop = None
         if along is not None and self._is_on(along):
-            stop = plan_path_stop(along, self.time_s, self._limits)
-        self.mode, self.reason, self._blend, self._chase_ddq = ServoMode.BRAKING, reason, None, None
-        self._stop_path, self._since_s = stop or self._brake.plan(self.q, self._dq, self._ddq), 0.0
+            stop = plan_path_stop(along, self.trajectory_time_s, self._limits)
+        self.mode, self.reason, self._blend, self._tracked_ddq = ServoMode.BRAKING, reason, None, None
+        self._stop, self._since_s = stop or self._brake.plan(self.q, self._dq, self._ddq), 0.0
 
-    def _is_on(self, path: Playback) -> bool:
-        """Whether the last command was a point of `path`: nothing blended into it, nothing clipped off it."""
+    def _is_on(self, path: TrajectoryBuffer) -> bool:
+        """Return True when the last command was a point of `path`, neither blended into it nor clipped off it."""
         if path.trajectory_id != self.trajectory_id or self.mode is not ServoMode.TRACKING or self._blend is not None:
             return False
-        return bool(np.abs(path.at(self.time_s)[0] - self.q).max() < _ON_PATH_RAD)
+        return bool(np.abs(path.at(self.trajectory_time_s)[0] - self.q).max() < _ON_PATH_RAD)
 
-    def rest(self) -> Wish:
-        """Brake if that is not over, else hold."""
-        if self._stop_path is None:
-            return self._blended(self._hold_q, _ZERO)
+    def brake_or_hold(self) -> JointCommand:
+        """Continue a stop that is not over, else hold."""
+        if self._stop is None:
+            return self._apply_blend(self._hold_q, _ZERO)
         self._since_s += CONTROL_PERIOD_S
-        q, dq = self._stop_path.at(self._since_s)
-        if self._since_s >= self._stop_path.duration_s:
-            self._stop_path, self.mode, self._hold_q = None, ServoMode.HOLDING, q
-        return q, dq
+        q, dq = self._stop.at(self._since_s)
+        if self._since_s >= self._stop.duration_s:
+            self._stop, self.mode, self._hold_q = None, ServoMode.HOLDING, q
+        return JointCommand(q, dq)
 
-    def give_way(self, q_measured: np.ndarray) -> None:
-        """Hold the arm where it is measured (7,) [rad], not where it was sent; the gripper keeps what it holds."""
+    def yield_to_measured(self, q_measured: np.ndarray) -> None:
+        """Hold the measured arm position (7,) [rad] instead of the commanded one; the gripper keeps its command, so
+        that it keeps its object."""
         hold_q = self._hold_q.copy()
-        off = np.abs(hold_q - q_measured) > _GIVE_WAY_RAD
+        off = np.abs(hold_q - q_measured) > _YIELD_THRESHOLD_RAD
         off[N_ARM] = False
         if off.any():
             hold_q[off] = q_measured[off]
             self._hold_q = hold_q
-            self._join(hold_q, _ZERO)
+            self._start_blend(hold_q, _ZERO)
 
-    def _join(self, q: np.ndarray, dq: np.ndarray) -> None:
-        """Blend from the present command into a motion that begins with `q`, `dq`."""
-        # The new motion begins a tick after the last command, and by then the old one would have gone on.
+    def _start_blend(self, q: np.ndarray, dq: np.ndarray) -> None:
+        """Blend from the present command into a motion that begins with `q`, `dq` (7,)."""
+        # The new motion begins a tick after the last command, in which the old one would have continued.
         gap, gap_rate = self.q + CONTROL_PERIOD_S * self._dq - q, self._dq - dq
-        self._stop_path, self._blend, self._since_s = None, None, 0.0
+        self._stop, self._blend, self._since_s = None, None, 0.0
         if np.abs(gap).max() > 1e-9 or np.abs(gap_rate).max() > 1e-9:
             self._blend = Blend(gap, gap_rate, self._limits.ddq_max)
 
-    def _blended(self, q: np.ndarray, dq: np.ndarray) -> Wish:
+    def _apply_blend(self, q: np.ndarray, dq: np.ndarray) -> JointCommand:
         if self._blend is None:
-            return q, dq
-        left, left_rate = self._blend.at(self._since_s)
+            return JointCommand(q, dq)
+        offset, offset_rate = self._blend.at(self._since_s)
         if self._since_s >= self._blend.duration_s:
             self._blend = None
         self._since_s += CONTROL_PERIOD_S
-        return q + left, dq + left_rate
+        return JointCommand(q + offset, dq + offset_rate)

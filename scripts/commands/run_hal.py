@@ -77,8 +77,8 @@ def main(config: Config) -> int:
     for room in ("hal", "sim_twin"):
         logging.getLogger(room).setLevel(logging.INFO)
     rig = make_rig(config)
-    stop_event, hurry_event = Event(), Event()
-    stop_on_signals(stop_event, hurry_event)
+    stop_event, force_exit_event = Event(), Event()
+    stop_on_signals(stop_event, force_exit_event)
     if config.until_stdin_closes:
         Thread(target=_watch_stdin, args=(stop_event,), daemon=True).start()
     with ExitStack() as undo:
@@ -97,8 +97,8 @@ def main(config: Config) -> int:
             on_ready=ready,
             workspace=config.workspace,
             cpu=config.cpu,
-            hurry_event=hurry_event,
-            readonly=config.readonly,
+            force_exit_event=force_exit_event,
+            monitor_only=config.readonly,
         )
     return 0
 

@@ -40,8 +40,8 @@ def main(config: StopConfig) -> int:
     # Not `RemoteArm`: it waits for the arm's first state, and a stop must get through to an arm that sends none.
     link = BusLink(config.bus, WallClock(), "the arm")
     try:
-        link.ask(keys.STOP, config.reason.encode(), "stop command")
-        status = wait_for_mode(lambda: decode(link.ask(keys.READ_STATUS), ServoStatus), ServoMode.STOPPED)
+        link.request(keys.STOP, config.reason.encode(), "stop command")
+        status = wait_for_mode(lambda: decode(link.request(keys.READ_STATUS), ServoStatus), ServoMode.STOPPED)
     finally:
         link.close()
     print(describe(status))

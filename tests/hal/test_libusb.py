@@ -1,4 +1,4 @@
-"""What links against libusb can be imported after the preload."""
+"""Modules that link against libusb can be imported after the preload."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ from importlib.util import find_spec
 import pytest
 
 from hal import libusb
+
+pytestmark = pytest.mark.integration
 
 
 def test_preloading_twice_gives_the_same_library() -> None:

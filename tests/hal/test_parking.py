@@ -1,4 +1,4 @@
-"""The arm is folded before its motors go soft, and is left alone when it had better be."""
+"""Parking folds the arm before its motors are disabled, except where it must not move."""
 
 from __future__ import annotations
 
@@ -19,6 +19,8 @@ from hal.servo.guard import Guard
 from hal.servo.servo import Servo
 from hal.servo.servo_thread import ServoThread
 
+pytestmark = pytest.mark.integration
+
 FOLDED = np.array([0.0, 0.0, -0.005, -0.074, 0.0, 0.0])
 QUICK = Parking(q=FOLDED, speed_rad_s=3.0)
 LEISURELY = Parking(q=FOLDED, speed_rad_s=0.05)
@@ -36,7 +38,7 @@ def ticking(guard: Guard | None = None, q: np.ndarray | None = None) -> Iterator
 
 
 def after_moving(servo: Servo, act: Callable[[Event], None]) -> Event:
-    """Return an event like `park`'s `give_up`, which is asked again and again, and acts once the arm moves."""
+    """Return an event for `park`'s `abort`, which is polled, and which acts once the arm moves."""
 
     class Acting(Event):
         acted = False
@@ -50,37 +52,37 @@ def after_moving(servo: Servo, act: Callable[[Event], None]) -> Event:
     return Acting()
 
 
-def test_the_arm_is_folded_slowly_and_progress_is_told(caplog: pytest.LogCaptureFixture) -> None:
+def test_the_arm_is_folded_slowly_and_progress_is_logged(caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.INFO, logger="hal.parking"), ticking(Guard()) as (servo, arm):
-        servo.claim("somebody")
+        servo.claim("a client")
         assert park(servo, QUICK, Event())
         assert arm.read_state().q[: z1.N_ARM] == pytest.approx(FOLDED, abs=1e-2)
     assert "parking: 0 of" in caplog.text
     assert caplog.records[-1].getMessage() == "parked"
 
 
-def test_what_the_gripper_holds_is_not_folded_away(caplog: pytest.LogCaptureFixture) -> None:
+def test_an_arm_with_an_object_in_the_gripper_is_not_parked(caplog: pytest.LogCaptureFixture) -> None:
     with ticking() as (servo, arm):
-        arm.offset[z1.N_ARM] = -0.02  # something keeps the jaws open: 2.6 Nm
+        arm.offset[z1.N_ARM] = -0.02  # an object keeps the jaws open: 2.6 Nm
         while abs(servo.read_state().tau[z1.N_ARM]) < 1.0:
             Event().wait(0.01)
         q = servo.status().q_command
         assert not park(servo, QUICK, Event())
         assert servo.status().q_command == pytest.approx(q)
-    assert "the gripper holds something" in caplog.text
+    assert "the gripper holds an object" in caplog.text
 
 
-def test_a_stopped_arm_is_left_where_it_is(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_stopped_arm_is_not_parked(caplog: pytest.LogCaptureFixture) -> None:
     with ticking() as (servo, _):
         servo.stop("the button")
         assert not park(servo, QUICK, Event())
         assert servo.status().q_command[:6] == pytest.approx(z1.Q_HOME)
         while servo.status().mode is not ServoMode.STOPPED:  # the button may be pressed before the first tick
             Event().wait(0.01)
-    assert "not parked: the arm is stopped (the button)" in caplog.text
+    assert "not parked: servo: the arm is stopped (the button)" in caplog.text
 
 
-def test_a_stop_on_the_way_ends_it(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_stop_ends_the_parking(caplog: pytest.LogCaptureFixture) -> None:
     with ticking() as (servo, _):
         assert not park(servo, LEISURELY, after_moving(servo, lambda _: servo.stop("a hand came near")))
         while servo.status().mode is not ServoMode.STOPPED:
@@ -88,19 +90,19 @@ def test_a_stop_on_the_way_ends_it(caplog: pytest.LogCaptureFixture) -> None:
     assert "a hand came near" in caplog.text
 
 
-def test_whoever_will_not_wait_need_not(caplog: pytest.LogCaptureFixture) -> None:
+def test_the_operator_can_abort_the_parking(caplog: pytest.LogCaptureFixture) -> None:
     with ticking() as (servo, _):
         assert not park(servo, LEISURELY, after_moving(servo, Event.set))
-    assert "somebody did not want to wait" in caplog.text
+    assert "parking aborted by the operator" in caplog.text
 
 
-def test_where_the_straight_way_is_forbidden_it_goes_by_way_of_home(caplog: pytest.LogCaptureFixture) -> None:
-    """From this pose the straight way to the folded one takes the arm through itself."""
+def test_where_the_guard_forbids_the_straight_path_it_parks_by_way_of_home(caplog: pytest.LogCaptureFixture) -> None:
+    """From this pose the straight path to the folded one is in self-collision."""
     low = np.array([0.95, 2.1, -0.92, 0.81, -1.13, -2.2, -0.5])
     guard = Guard()
-    assert guard.refusal(low[None], np.append(z1.Q_HOME, 0.0)) is None
-    share = np.linspace(0.0, 1.0, 100)[:, None]
-    assert guard.refusal(low + share * (np.append(FOLDED, -0.5) - low), low) is not None
+    assert guard.find_violation(low[None], np.append(z1.Q_HOME, 0.0)) is None
+    ratio = np.linspace(0.0, 1.0, 100)[:, None]
+    assert guard.find_violation(low + ratio * (np.append(FOLDED, -0.5) - low), low) is not None
     with caplog.at_level(logging.INFO, logger="hal.parking"), ticking(guard, low) as (servo, arm):
         assert park(servo, QUICK, Event())
         assert arm.read_state().q[: z1.N_ARM] == pytest.approx(FOLDED, abs=1e-2)

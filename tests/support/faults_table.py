@@ -1,6 +1,6 @@
-"""The table that `./z1 test -m faults` prints at its end: what was injected, what the arm did, what was read.
+"""Table of injected faults, the arm's reaction and the operator's message, printed by `./z1 test -m faults`.
 
-A test takes the fixture `faults_table` and adds a row of what it has measured; nothing in it is known beforehand.
+A test takes the fixture `faults_table` and adds a row of its measurements; no value in it is fixed beforehand.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ class Row:
     """One fault."""
 
     fault: str
-    """What was injected."""
+    """Injected fault."""
     arm: str
-    """What the arm did."""
+    """Reaction of the arm."""
     noticed_s: float | None
-    """From the fault to the first sign of it [s]; None where nothing had to be noticed."""
+    """Time from the fault to its detection [s]; None where there is nothing to detect."""
     rest_s: float | None
-    """From the fault to the arm's last motion [s]; None where it went on, or did not move."""
+    """Time from the fault to the arm's last motion [s]; None where it continued, or did not move."""
     reads: str
-    """What the operator reads."""
+    """Message for the operator."""
 
 
 class FaultsTable:
@@ -57,11 +57,11 @@ class FaultsTable:
 
 
 def describe(status: ServoStatus, moved: np.ndarray) -> str:
-    """Say what an arm did that has `status` now and went by `moved` (7,) [rad] since the fault."""
-    what = {ServoMode.STOPPED: "braked, stopped until re-armed", ServoMode.HOLDING: "braked, holds"}
+    """Return the arm's reaction in words, from its `status` and its motion `moved` (7,) [rad] since the fault."""
+    reactions = {ServoMode.STOPPED: "braked, stopped until re-armed", ServoMode.HOLDING: "braked, holds"}
     joint = int(np.abs(moved[:N_ARM]).argmax())
-    further = f"{JOINT_NAMES[joint]} went on by {1e3 * abs(moved[joint]):.0f} mrad"
-    return f"{what.get(status.mode, status.mode.value)}; {further}"
+    further = f"{JOINT_NAMES[joint]} moved on by {1e3 * abs(moved[joint]):.0f} mrad"
+    return f"{reactions.get(status.mode, status.mode.value)}; {further}"
 
 
 _ROWS = pytest.StashKey[FaultsTable]()
@@ -73,7 +73,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.fixture(scope="session")
 def faults_table(request: pytest.FixtureRequest) -> FaultsTable:
-    """Takes the rows."""
+    """The table of this run."""
     return request.config.stash[_ROWS]
 
 
@@ -87,8 +87,8 @@ def _print(rows: list[Row]) -> None:
     """Print the table as wide as the terminal is; into a file or a pipe as Markdown."""
     is_screen = sys.stdout.isatty()
     table = Table(title="Faults injected" if is_screen else None, box=box.ROUNDED if is_screen else box.MARKDOWN)
-    for column, how in (("fault", "left"), ("the arm", "left"), ("noticed", "right"), ("rests", "right")):
-        table.add_column(column, justify=how, overflow="fold")  # pyright: ignore[reportArgumentType]
+    for column, justify in (("fault", "left"), ("the arm", "left"), ("noticed", "right"), ("rests", "right")):
+        table.add_column(column, justify=justify, overflow="fold")  # pyright: ignore[reportArgumentType]
     table.add_column("the operator reads", overflow="fold")
     for row in rows:
         cells = (row.fault, row.arm, _duration(row.noticed_s), _duration(row.rest_s), row.reads)

@@ -1,4 +1,4 @@
-"""Every message survives the wire, and nothing else gets through it."""
+"""The codec returns every message unchanged, and rejects everything else."""
 
 from __future__ import annotations
 
@@ -24,6 +24,7 @@ from hal.base.messages import (
     TrajectoryChunk,
 )
 from hal.bus.codec import MAX_BYTES, Hello, decode, decode_text, encode, encode_into
+from tests.support.errors import raises
 
 RNG = np.random.default_rng(3)
 INTRINSICS = Intrinsics(width=6, height=4, fx=380.5, fy=381.0, cx=2.5, cy=1.75)
@@ -106,7 +107,7 @@ def test_there_is_a_sample_of_every_message_type():
 
 
 @pytest.mark.parametrize("sample", SAMPLES, ids=lambda sample: type(sample).__name__)
-def test_a_message_comes_back_as_it_went(sample):
+def test_a_message_is_decoded_as_it_was_encoded(sample):
     back = decode(encode(sample), type(sample))
     assert type(back) is type(sample)
     for field in dataclasses.fields(sample):
@@ -121,75 +122,81 @@ def test_encoding_into_a_buffer_of_any_length_gives_the_same_bytes(sample):
 
 
 def test_decoded_arrays_cannot_be_changed():
-    with pytest.raises(ValueError, match="read-only"):
+    with pytest.raises(ValueError, match="read-only"):  # NumPy's text: it has no type of its own
         decode(encode(STATUS)).q_command[0] = 1.0
 
 
-def test_object_arrays_are_refused():
+def test_object_arrays_are_rejected():
     state = ArmState(stamp_s=0.0, q=np.zeros(7), dq=np.zeros(7), tau=np.zeros(7))
     object.__setattr__(state, "q", np.array([object()] * 7))
-    with pytest.raises(InvalidMessageError, match="object"):
+    with raises(InvalidMessageError, "invalid_dtype"):
         encode(state)
 
 
-def test_what_is_not_a_message_is_not_encoded():
-    with pytest.raises(TypeError, match="not a message"):
+def test_an_object_of_another_type_is_not_encoded():
+    with pytest.raises(TypeError):
         encode({"q": 1})
 
 
-def test_a_message_of_another_type_than_asked_for_is_refused():
-    with pytest.raises(InvalidMessageError, match=r"'ArmSetpoint'.*allowed here: ArmState"):
+def test_a_message_of_another_type_than_expected_is_rejected():
+    with raises(InvalidMessageError, "unknown_type"):
         decode(encode(ArmSetpoint(q=np.zeros(7), dq=np.zeros(7))), ArmState)
 
 
-def test_another_version_is_refused_with_both_numbers():
+def test_another_version_is_rejected():
     data = bytearray(ENCODED[0])
     data[2] = 9
-    with pytest.raises(InvalidMessageError, match=r"version 9.*speaks 1"):
+    with raises(InvalidMessageError, "other_version"):
         decode(bytes(data))
 
 
-def test_oversize_is_refused_before_it_is_looked_at():
-    with pytest.raises(InvalidMessageError, match=f"allowed are 8 to {MAX_BYTES}"):
+def test_an_oversized_payload_is_rejected_before_it_is_parsed():
+    with raises(InvalidMessageError, "invalid_length"):
         decode(bytes(MAX_BYTES + 1))
 
 
 @pytest.mark.parametrize(
-    ("data", "words"),
+    ("data", "code"),
     [
-        (b"", "0 bytes"),
-        (b"hello, world", "begins with"),
-        (_envelope(["os.system", {"command": "true"}]), "os.system"),
-        (_envelope(["ArmSetpoint", {}]), "needed are"),
-        (_envelope({"type": "ArmSetpoint"}), "expected is"),
-        (_envelope(["ArmSetpoint", {"q": [7], "dq": [2**62]}], bytes(56)), "shape"),
-        (_envelope(["ArmSetpoint", {"q": [7], "dq": [-7]}], bytes(112)), "shape"),
-        (_envelope(["ArmSetpoint", {"q": [0, 2**26, 2**26, 2**26], "dq": [7]}], bytes(56)), "shape"),
-        (_envelope(["ArmSetpoint", {"q": [7], "dq": [7]}], bytes(111)), "55 are there"),
-        (_envelope(["ArmSetpoint", {"q": [7], "dq": [7]}], bytes(113)), "113 bytes"),
-        (_envelope(["ArmSetpoint", {"q": [6], "dq": [7]}], bytes(104)), r"\(6,\)"),
-        (_envelope(["ArmSetpoint", {"q": [7], "dq": [7]}], bytes(48) + np.float64(np.nan).tobytes() * 8), "finite"),
-        (_with(STATUS, mode="dancing"), "dancing"),
-        (_with(STATUS, mode=["holding"]), "mode"),
-        (_with(STATUS, ticks=1.0), "ticks"),
-        (_with(STATUS, ticks=True), "ticks"),
-        (_with(STATUS, finished=1), "finished"),
-        (_with(STATUS, stamp_s=float("inf")), "finite"),
-        (_with(STATUS, q_command=None), "q_command"),
-        (_with(SAMPLES[1], intrinsics={"width": 6}), "intrinsics"),
-        (_with(SAMPLES[1], intrinsics={**dataclasses.asdict(INTRINSICS), "width": 7}), "shape"),
-        (_with(SAMPLES[3], faults="hot"), "faults"),
-        (_with(SAMPLES[3], faults=[1]), r"faults\[0\]"),
-        (ENCODED[2][:-1] + b"\x02", "mask"),
-        (b"Z1\x01\x00\xff\xff\xff\xff" + bytes(50), "header of 4294967295 bytes"),
+        (b"", "invalid_length"),
+        (b"hello, world", "invalid_magic"),
+        (_envelope(["os.system", {"command": "true"}]), "unknown_type"),
+        (_envelope(["ArmSetpoint", {}]), "invalid_fields"),
+        (_envelope({"type": "ArmSetpoint"}), "invalid_header"),
+        (_envelope(["ArmSetpoint", {"q": [7], "dq": [2**62]}], bytes(56)), "invalid_array"),
+        (_envelope(["ArmSetpoint", {"q": [7], "dq": [-7]}], bytes(112)), "invalid_array"),
+        (_envelope(["ArmSetpoint", {"q": [0, 2**26, 2**26, 2**26], "dq": [7]}], bytes(56)), "invalid_array"),
+        (_envelope(["ArmSetpoint", {"q": [7], "dq": [7]}], bytes(111)), "invalid_array"),
+        (_envelope(["ArmSetpoint", {"q": [7], "dq": [7]}], bytes(113)), "invalid_length"),
+        (_envelope(["ArmSetpoint", {"q": [6], "dq": [7]}], bytes(104)), "wrong_shape"),
+        (_envelope(["ArmSetpoint", {"q": [7], "dq": [7]}], bytes(48) + np.float64(np.nan).tobytes() * 8), "not_finite"),
+        (_with(STATUS, mode="dancing"), "invalid_field"),
+        (_with(STATUS, mode=["holding"]), "invalid_field"),
+        (_with(STATUS, ticks=1.0), "invalid_field"),
+        (_with(STATUS, ticks=True), "invalid_field"),
+        (_with(STATUS, finished=1), "invalid_field"),
+        (_with(STATUS, stamp_s=float("inf")), "invalid_field"),
+        (_with(STATUS, q_command=None), "invalid_array"),
+        (_with(SAMPLES[1], intrinsics={"width": 6}), "invalid_field"),
+        (_with(SAMPLES[1], intrinsics={**dataclasses.asdict(INTRINSICS), "width": 7}), "wrong_shape"),
+        (_with(SAMPLES[3], faults="hot"), "invalid_field"),
+        (_with(SAMPLES[3], faults=[1]), "invalid_field"),
+        (ENCODED[2][:-1] + b"\x02", "invalid_array"),
+        (b"Z1\x01\x00\xff\xff\xff\xff" + bytes(50), "invalid_header"),
     ],
 )
-def test_each_kind_of_damage_is_named(data, words):
-    with pytest.raises(InvalidMessageError, match=words):
+def test_each_kind_of_damage_has_its_code(data, code):
+    with raises(InvalidMessageError, code):
         decode(data)
 
 
-def _only_messages_or_refusals(data: bytes) -> None:
+def test_the_text_of_an_invalid_field_names_the_field_its_value_and_the_allowed_ones():
+    with raises(InvalidMessageError, "invalid_field") as caught:
+        decode(_with(STATUS, mode="dancing"))
+    assert str(caught.value) == ("codec: ServoStatus.mode is 'dancing' (allowed holding, tracking, braking, stopped).")
+
+
+def _check_message_or_rejection(data: bytes) -> None:
     try:
         message = decode(data)
     except InvalidMessageError:
@@ -198,20 +205,20 @@ def _only_messages_or_refusals(data: bytes) -> None:
 
 
 @given(st.sampled_from(ENCODED), st.data())
-def test_a_truncated_message_is_always_refused(data, draw):
+def test_a_truncated_message_is_always_rejected(data, draw):
     cut = draw.draw(st.integers(0, len(data) - 1))
     with pytest.raises(InvalidMessageError):
         decode(data[:cut])
 
 
 @given(st.sampled_from(ENCODED), st.data())
-def test_mutated_bytes_give_a_message_or_a_refusal(data, draw):
+def test_mutated_bytes_give_a_message_or_a_rejection(data, draw):
     damaged = bytearray(data)
     for _ in range(draw.draw(st.integers(1, 4))):
         # Most of a message is array: aim at the header half of the time.
         end = draw.draw(st.sampled_from([min(len(data), 120), len(data)]))
         damaged[draw.draw(st.integers(0, end - 1))] = draw.draw(st.integers(0, 255))
-    _only_messages_or_refusals(bytes(damaged))
+    _check_message_or_rejection(bytes(damaged))
 
 
 _JSON = st.recursive(
@@ -222,20 +229,20 @@ _JSON = st.recursive(
 
 
 @given(st.sampled_from(SAMPLES), st.data())
-def test_any_value_in_any_field_gives_a_message_or_a_refusal(sample, draw):
+def test_any_value_in_any_field_gives_a_message_or_a_rejection(sample, draw):
     field = draw.draw(st.sampled_from([field.name for field in dataclasses.fields(sample)]))
-    _only_messages_or_refusals(_with(sample, **{field: draw.draw(_JSON)}))
+    _check_message_or_rejection(_with(sample, **{field: draw.draw(_JSON)}))
 
 
 @given(st.binary(max_size=200), st.booleans())
-def test_arbitrary_bytes_are_refused(data, framed):
+def test_arbitrary_bytes_are_rejected(data, framed):
     if framed:
         data = b"Z1\x01\x00" + len(data).to_bytes(4, "little") + data
     with pytest.raises(InvalidMessageError):
         decode(data)
 
 
-@pytest.mark.parametrize(("data", "words"), [(b"\xff\xfe", "UTF-8"), (b"a" * 2001, "2001 bytes")])
-def test_a_text_that_is_too_long_or_not_utf8_is_refused(data, words):
-    with pytest.raises(InvalidMessageError, match=words):
+@pytest.mark.parametrize("data", [b"\xff\xfe", b"a" * 2001])
+def test_a_text_that_is_too_long_or_not_utf8_is_rejected(data):
+    with raises(InvalidMessageError, "invalid_text"):
         decode_text(data, "the owner")

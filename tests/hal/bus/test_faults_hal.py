@@ -19,6 +19,8 @@ from sim_twin.model.world import World
 from tests.support.faults_table import FaultsTable
 from tests.support.hal.bus_hal import end_processes, free_config, moving, set_off, start_python, wait_until
 
+pytestmark = pytest.mark.integration
+
 SERVE = """
 import sys
 from threading import Event

@@ -1,4 +1,4 @@
-"""The health of a HAL process, as whoever commands nothing reads it."""
+"""The health of a HAL process, as read by a client that commands nothing."""
 
 from __future__ import annotations
 
@@ -8,10 +8,13 @@ from hal.base.clock import WallClock
 from hal.base.errors import HalTimeoutError
 from hal.base.messages import ServoMode
 from hal.bus.health import describe_health, wait_for_health
+from tests.support.errors import raises
 from tests.support.hal.bus_hal import free_config, wait_until
 
+pytestmark = pytest.mark.integration
 
-def test_the_health_of_a_servo_is_what_its_thread_measured(hal, remote_arm):
+
+def test_the_health_of_a_servo_is_its_threads_measurement(hal, remote_arm):
     remote_arm.claim()
     wait_until(lambda: hal.servo.health().rate_hz > 0)
     health = wait_for_health(hal.config, WallClock())
@@ -22,17 +25,17 @@ def test_the_health_of_a_servo_is_what_its_thread_measured(hal, remote_arm):
     assert health.faults == ()
     assert health.real_time == hal.servo.real_time
     assert f"at {health.rate_hz:.1f} Hz" in describe_health(health)
-    assert "heard" in describe_health(health)
+    assert f"last command of {health.owner}" in describe_health(health)
 
 
-def test_faults_are_told(hal):
+def test_faults_are_reported(hal):
     hal.arm.inject_fault("overheat joint 2")
     wait_until(lambda: hal.servo.status().mode is ServoMode.STOPPED)
     health = wait_until(lambda: (h := wait_for_health(hal.config, WallClock())).mode is ServoMode.STOPPED and h)
     assert health.faults == ("the arm reports overheat joint 2",)
-    assert describe_health(health).endswith("nobody commands; the arm reports overheat joint 2")
+    assert describe_health(health).endswith("no command owner; the arm reports overheat joint 2")
 
 
-def test_where_nobody_serves_that_is_said():
-    with pytest.raises(HalTimeoutError, match="no HAL process answers"):
+def test_without_a_hal_process_it_raises():
+    with raises(HalTimeoutError, "no_hal"):
         wait_for_health(free_config(connect_timeout_s=0.2), WallClock())

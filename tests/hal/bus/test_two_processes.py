@@ -1,4 +1,4 @@
-"""The link between real processes: what happens when one of them dies, ends, or is told to stop."""
+"""The link between real processes, of which one is killed, ends, or gets a stop signal."""
 
 from __future__ import annotations
 
@@ -17,6 +17,8 @@ from hal.bus.client import RemoteArm, RemoteCamera
 from tests.support.faults_table import FaultsTable, describe
 from tests.support.hal.bus_hal import end_processes, free_config, moving, set_off, start_python, wait_until
 
+pytestmark = pytest.mark.integration
+
 BRAKED_WITHIN_S = 0.4
 """The safety requirement: from the death of the commanding process to the arm at rest [s]."""
 
@@ -31,7 +33,7 @@ arm.claim()
 arm.stream(slow_motion())
 Event().wait()
 """
-LOOK = """
+WATCH = """
 import sys
 from hal.bus.client import BusConfig, RemoteArm, RemoteCamera
 config = BusConfig(port=int(sys.argv[1]))
@@ -68,7 +70,7 @@ from hal.bus.client import RemoteCamera
 from hal.bus.session import BusConfig
 from hal.process import serve
 
-def look():
+def watch():
     with RemoteCamera(config) as camera:
         camera.wait_for_frame(5.0)
         print(camera.shared_memory)
@@ -78,7 +80,7 @@ config, end = BusConfig(port=int(sys.argv[1])), Event()
 end.set()
 serve(make_rig(), config, end)
 end.clear()
-serve(make_rig(), config, end, on_ready=look)
+serve(make_rig(), config, end, on_ready=watch)
 """
 
 
@@ -158,7 +160,7 @@ def test_frames_cross_in_shared_memory_of_which_nothing_is_left_once_both_proces
     try:
         assert server.stdout is not None
         assert server.stdout.readline() == "ready\n"
-        client = start_python(LOOK, config.port, manners)
+        client = start_python(WATCH, config.port, manners)
         assert client.stdout is not None
         assert client.stdout.readline() == "through shared memory\n"
         mapped = _shared_memory_of(server) | _shared_memory_of(client)
@@ -185,7 +187,7 @@ def test_the_second_server_of_a_process_shares_memory_as_the_first():
 
 @pytest.mark.faults
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_hal_process_told_to_end_in_motion_brakes_first(number, faults_table: FaultsTable):
+def test_a_hal_process_that_gets_a_signal_in_motion_brakes_first(number, faults_table: FaultsTable):
     config = free_config(connect_timeout_s=20.0)
     process = start_python(SERVE, config.port)
     try:
@@ -209,7 +211,7 @@ def test_a_hal_process_told_to_end_in_motion_brakes_first(number, faults_table: 
         assert abs(last.q[0] - first.q[0]) < 0.3, "the motion of 0.6 rad was cut short"
         moving_s = [state.stamp_s for state in states if np.abs(state.dq).max() > 0.01]
         faults_table.add(
-            f"HAL told to end by {signal.Signals(number).name}",
+            f"HAL ended by {signal.Signals(number).name}",
             arm=f"brakes and holds; joint1 {1e3 * abs(last.q[0] - first.q[0]):.0f} mrad further",
             rest_s=max(moving_s) - first.stamp_s,
             reads=reads,

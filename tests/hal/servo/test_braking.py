@@ -1,4 +1,4 @@
-"""Stops, blends and chases by themselves."""
+"""Stops, blends and target tracking, each alone."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ import pytest
 
 from hal.base.messages import TrajectoryChunk
 from hal.base.z1 import CONTROL_PERIOD_S, DDQ_MAX, DQ_MAX, N_JOINTS, Q_MAX, Q_MIN
-from hal.servo.braking import Blend, Brake, Chaser, plan_path_stop
+from hal.servo.braking import Blend, Brake, TargetTracker, plan_path_stop
 from hal.servo.limits import ServoLimits
-from hal.servo.trajectory_buffer import Playback
+from hal.servo.trajectory_buffer import TrajectoryBuffer
 from tests.support.hal.servo_bench import START, Bench
 
 LIMITS = ServoLimits()
@@ -37,7 +37,7 @@ def test_a_joint_near_its_limit_brakes_harder_and_the_others_do_not() -> None:
     assert path[:, others] == pytest.approx(np.array([free.at(t)[0] for t in times])[:, others])
 
 
-def test_a_blend_dies_out_within_the_acceleration_limits() -> None:
+def test_a_blend_decays_within_the_acceleration_limits() -> None:
     q, dq = np.linspace(-0.05, 0.05, N_JOINTS), np.linspace(1.0, -1.0, N_JOINTS)
     blend = Blend(q, dq, DDQ_MAX)
     times = np.arange(0, blend.duration_s + 0.01, CONTROL_PERIOD_S)
@@ -50,11 +50,11 @@ def test_a_blend_dies_out_within_the_acceleration_limits() -> None:
     assert (np.abs(np.diff(rate, axis=0)) / CONTROL_PERIOD_S <= DDQ_MAX + 1e-6).all()
 
 
-def test_a_chase_arrives_at_the_limit_when_its_target_lies_beyond() -> None:
-    chaser = Chaser(LIMITS)
+def test_tracking_ends_at_the_joint_limit_when_the_target_is_beyond_it() -> None:
+    tracker = TargetTracker(LIMITS)
     q, dq, ddq = MIDDLE, ZERO, ZERO
     for _ in range(1500):
-        q, dq, ddq = chaser.step(Q_MAX + 1.0, q, dq, ddq)
+        q, dq, ddq = tracker.step(Q_MAX + 1.0, q, dq, ddq)
         assert (q <= Q_MAX + 1e-6).all()
         assert (np.abs(dq) <= DQ_MAX + 1e-9).all()
         assert (np.abs(ddq) <= DDQ_MAX + 1e-9).all()
@@ -65,14 +65,14 @@ def test_a_chase_arrives_at_the_limit_when_its_target_lies_beyond() -> None:
 # --- On the path ----------------------------------------------------------------------------------------------------
 
 
-def circle(duration_s: float, speed: float = 1.0) -> Playback:
-    """Joints 1 and 2 go round a circle of 0.3 rad: no straight line, which every way of braking would stay on."""
+def circle(duration_s: float, speed: float = 1.0) -> TrajectoryBuffer:
+    """Return joints 1 and 2 on a circle of 0.3 rad; on a straight line every kind of braking would stay on the path."""
     t_s = np.arange(0.0, duration_s + 1e-9, 0.02)
     q, dq = np.zeros((len(t_s), N_JOINTS)), np.zeros((len(t_s), N_JOINTS))
     turn = speed / 0.3
     q[:, 0], q[:, 1] = 0.3 * np.cos(turn * t_s), 0.3 * np.sin(turn * t_s)
     dq[:, 0], dq[:, 1] = -speed * np.sin(turn * t_s), speed * np.cos(turn * t_s)
-    return Playback(1, t_s.tolist(), q, dq, False)
+    return TrajectoryBuffer(1, t_s.tolist(), q, dq, False)
 
 
 @pytest.mark.parametrize("speed", [0.05, 0.5, 1.0])
@@ -90,20 +90,20 @@ def test_a_stop_on_the_path_stays_on_it_and_begins_and_ends_without_a_jump(speed
     assert stop.duration_s <= LIMITS.brake_s
 
 
-def test_too_short_a_path_is_no_path_to_stop_on() -> None:
+def test_a_path_that_is_too_short_has_no_path_stop() -> None:
     path = circle(1.0)
     assert plan_path_stop(path, 0.99, LIMITS) is None
     assert plan_path_stop(path, 0.80, LIMITS) is not None
 
 
 def test_a_stopped_arm_stays_on_its_path_if_it_bends() -> None:
-    """The same path, played by the servo: home on the circle, then the stop."""
+    """The same path, played by the servo: from home along the circle, then the stop."""
     start = START.copy()
     path = circle(1.5, 0.6)
     shift = start - path.q[0]
     ramp = np.array(path.t_s) / 1.5
-    ease = ramp**2 * (2.0 - ramp)  # from rest: the circle is gone round ever faster
-    pieces = [path.at(1.5 * s) for s in ease]
+    time_scale = ramp**2 * (2.0 - ramp)  # from rest: the circle is played faster and faster
+    pieces = [path.at(1.5 * s) for s in time_scale]
     rate = ramp * (4.0 - 3.0 * ramp)
     chunk = TrajectoryChunk(
         trajectory_id=1,

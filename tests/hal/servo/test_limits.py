@@ -1,4 +1,4 @@
-"""What the servo lets through to the arm."""
+"""Limits between the servo and the arm."""
 
 from __future__ import annotations
 
@@ -7,7 +7,15 @@ import pytest
 
 from hal.base.errors import InvalidMessageError
 from hal.base.z1 import CONTROL_PERIOD_S, DQ_MAX, KP, N_ARM, N_JOINTS, Q_MAX, Q_MIN
-from hal.servo.limits import ClippedSetpoint, OverloadWatch, ServoLimits, clip_setpoint, find_blocked, servo_torque
+from hal.servo.limits import (
+    ClippedSetpoint,
+    OverloadDetector,
+    ServoLimits,
+    clip_setpoint,
+    compute_servo_torque,
+    find_blocked,
+)
+from tests.support.errors import raises
 
 LIMITS = ServoLimits()
 MIDDLE = (Q_MIN + Q_MAX) / 2
@@ -20,7 +28,7 @@ def clip(
     return clip_setpoint(LIMITS, q, dq, q_last=q_last, q_measured=q_measured, dq_measured=dq_measured)
 
 
-def test_a_harmless_setpoint_is_let_through_as_it_is() -> None:
+def test_a_setpoint_within_the_limits_is_unchanged() -> None:
     q = MIDDLE + 0.001
     allowed = clip(q, ZERO + 0.5, MIDDLE, MIDDLE)
     assert (allowed.q == q).all()
@@ -41,50 +49,50 @@ def test_positions_end_at_the_joint_limits(edge: np.ndarray, side: float) -> Non
     assert allowed.q == pytest.approx(edge)
 
 
-def test_what_is_clipped_at_a_joint_limit_is_not_told_to_move_on() -> None:
-    wish = MIDDLE.copy()
-    wish[4] = Q_MAX[4] + 0.001
-    allowed = clip(wish, ZERO + 1.0, wish, wish)
+def test_a_setpoint_clipped_at_a_joint_limit_has_no_velocity() -> None:
+    desired = MIDDLE.copy()
+    desired[4] = Q_MAX[4] + 0.001
+    allowed = clip(desired, ZERO + 1.0, desired, desired)
     assert allowed.dq.tolist() == [1, 1, 1, 1, 0, 1, 1]
 
 
 @pytest.mark.parametrize("side", [-1.0, 1.0])
 def test_the_gripper_leads_its_measurement_by_the_grip_torque_at_most(side: float) -> None:
-    wish = MIDDLE.copy()
-    wish[N_ARM] += side * 0.5
+    desired = MIDDLE.copy()
+    desired[N_ARM] += side * 0.5
     last = MIDDLE.copy()
     last[N_ARM] += side * 0.022
-    allowed = clip(wish, ZERO + 1.0, last, MIDDLE)
+    allowed = clip(desired, ZERO + 1.0, last, MIDDLE)
     assert KP[N_ARM] * (allowed.q - MIDDLE)[N_ARM] == pytest.approx(side * 3.0)
     assert allowed.dq[N_ARM] == 0.0
     assert not allowed.clipped
 
 
 @pytest.mark.parametrize("side", [-1.0, 1.0])
-def test_a_jaw_that_moves_is_led_by_what_it_goes_until_it_is_heard_of(side: float) -> None:
-    wish, moving = MIDDLE.copy(), ZERO.copy()
-    wish[N_ARM] += side * 0.06
+def test_a_moving_jaw_may_be_led_further_by_the_distance_of_its_latency(side: float) -> None:
+    desired, moving = MIDDLE.copy(), ZERO.copy()
+    desired[N_ARM] += side * 0.06
     moving[N_ARM] = side * 2.0
-    ahead = clip(wish, moving, wish, MIDDLE, moving)
-    assert ahead.q[N_ARM] == wish[N_ARM]
+    ahead = clip(desired, moving, desired, MIDDLE, moving)
+    assert ahead.q[N_ARM] == desired[N_ARM]
     assert ahead.dq[N_ARM] == side * 2.0
-    behind = clip(wish, moving, wish, MIDDLE, -moving)  # going the other way it is led by the torque alone
+    behind = clip(desired, moving, desired, MIDDLE, -moving)  # against its motion the torque alone leads it
     at_most = DQ_MAX[N_ARM] * CONTROL_PERIOD_S
     assert side * (behind.q - MIDDLE)[N_ARM] == pytest.approx(max(3.0 / KP[N_ARM], 0.06 - at_most))
 
 
-def test_a_jaw_said_to_move_faster_than_it_can_is_led_no_further_for_it() -> None:
-    wish, moving = MIDDLE.copy(), ZERO.copy()
-    wish[N_ARM] += 0.5
+def test_a_measured_jaw_speed_beyond_its_maximum_extends_the_lead_no_further() -> None:
+    desired, moving = MIDDLE.copy(), ZERO.copy()
+    desired[N_ARM] += 0.5
     moving[N_ARM] = 99.0
     last = MIDDLE.copy()
     last[N_ARM] += 0.5
-    lead = (clip(wish, ZERO, last, MIDDLE, moving).q - MIDDLE)[N_ARM]
-    most = 3.0 / KP[N_ARM] + DQ_MAX[N_ARM] * LIMITS.gripper_lag_s
-    assert lead == pytest.approx(max(most, 0.5 - DQ_MAX[N_ARM] * CONTROL_PERIOD_S))
+    lead = (clip(desired, ZERO, last, MIDDLE, moving).q - MIDDLE)[N_ARM]
+    max_lead = 3.0 / KP[N_ARM] + DQ_MAX[N_ARM] * LIMITS.gripper_lag_s
+    assert lead == pytest.approx(max(max_lead, 0.5 - DQ_MAX[N_ARM] * CONTROL_PERIOD_S))
 
 
-def test_an_arm_outside_its_limits_is_led_back_at_no_more_than_the_joints_speed() -> None:
+def test_an_arm_outside_its_limits_returns_at_no_more_than_the_joints_speed() -> None:
     outside = Q_MAX + 0.1
     allowed = clip(outside, ZERO, outside, outside)
     assert allowed.q[:N_ARM] == pytest.approx((outside - DQ_MAX * CONTROL_PERIOD_S)[:N_ARM])
@@ -99,40 +107,49 @@ def test_a_joint_that_does_not_follow_is_named() -> None:
     assert find_blocked(LIMITS, command, MIDDLE) == ""
 
 
-def test_a_motor_may_be_at_its_limit_for_a_tenth_of_a_second() -> None:
-    watch = OverloadWatch(LIMITS)
+def test_a_motor_may_be_at_its_torque_limit_for_a_tenth_of_a_second() -> None:
+    detector = OverloadDetector(LIMITS)
     tau = ZERO.copy()
     tau[2] = -30.0
-    assert [watch.update(tau, ZERO) for _ in range(50)] == [""] * 50
-    assert watch.update(tau, ZERO).startswith("joint3 has been at its torque limit (-30.0 Nm of 29.4) for")
+    assert [detector.update(tau, ZERO) for _ in range(50)] == [""] * 50
+    assert detector.update(tau, ZERO).startswith("joint3 has been at its torque limit (-30.0 Nm of 29.4) for")
 
 
-def test_a_command_may_ask_for_more_than_a_motor_has_for_a_tenth_of_a_second() -> None:
-    watch = OverloadWatch(LIMITS)
+def test_a_command_may_ask_for_more_than_the_maximum_torque_for_a_tenth_of_a_second() -> None:
+    detector = OverloadDetector(LIMITS)
     command = MIDDLE.copy()
     command[0] += 0.048
-    asked = servo_torque(command, MIDDLE)
-    assert asked[0] == pytest.approx(0.048 * 640)
-    assert [watch.update(ZERO, asked) for _ in range(50)] == [""] * 50
-    assert "joint1 does not follow: its command has asked for 30.7 Nm (allowed 30.0)" in watch.update(ZERO, asked)
+    requested = compute_servo_torque(command, MIDDLE)
+    assert requested[0] == pytest.approx(0.048 * 640)
+    assert [detector.update(ZERO, requested) for _ in range(50)] == [""] * 50
+    assert "joint1 does not follow: its command has asked for 30.7 Nm (allowed 30.0)" in detector.update(
+        ZERO, requested
+    )
 
 
-def test_a_gripper_may_be_asked_for_all_it_has() -> None:
-    watch = OverloadWatch(LIMITS)
-    asked = ZERO.copy()
-    asked[N_ARM] = 60.0
-    assert [watch.update(asked, asked) for _ in range(100)] == [""] * 100
+def test_the_gripper_may_stay_at_its_maximum_torque() -> None:
+    detector = OverloadDetector(LIMITS)
+    requested = ZERO.copy()
+    requested[N_ARM] = 60.0
+    assert [detector.update(requested, requested) for _ in range(100)] == [""] * 100
 
 
 def test_short_peaks_of_different_motors_do_not_add_up() -> None:
-    watch = OverloadWatch(LIMITS)
+    detector = OverloadDetector(LIMITS)
     for tick in range(300):
         tau = ZERO.copy()
         tau[tick // 40 % 2] = 60.0
-        assert watch.update(tau, ZERO) == ""
+        assert detector.update(tau, ZERO) == ""
 
 
-@pytest.mark.parametrize("options", [{"grip_torque_nm": -1.0}, {"q_min": Q_MAX}, {"dq_max": [1, 2]}])
-def test_limits_that_make_no_sense_are_refused(options: dict) -> None:
-    with pytest.raises(InvalidMessageError):
+@pytest.mark.parametrize(
+    ("options", "code"),
+    [
+        ({"grip_torque_nm": -1.0}, "invalid_limit"),
+        ({"q_min": Q_MAX}, "invalid_limit"),
+        ({"dq_max": [1, 2]}, "wrong_shape"),
+    ],
+)
+def test_invalid_limits_are_rejected(options: dict, code: str) -> None:
+    with raises(InvalidMessageError, code):
         ServoLimits(**options)

@@ -7,7 +7,7 @@ import pytest
 from hal.servo.periods import PeriodStatistics, PeriodSummary
 
 
-def test_periods_are_summed_up_only_while_they_are_measured() -> None:
+def test_periods_are_summarised_only_while_measured() -> None:
     periods = PeriodStatistics(capacity=1000)
     for i in range(10):
         periods.record(0.002 * i)
@@ -15,9 +15,9 @@ def test_periods_are_summed_up_only_while_they_are_measured() -> None:
     assert (periods.ticks, periods.overruns) == (10, 0)
 
 
-def test_median_and_tail_are_those_of_the_last_periods_in_the_ring() -> None:
+def test_percentiles_are_those_of_the_last_periods_in_the_ring() -> None:
     periods = PeriodStatistics(capacity=100)
-    periods.measure(True)
+    periods.set_measuring(True)
     now_s = 0.0
     for step_s in [0.5] * 100 + [0.002] * 100:
         periods.record(now_s)
@@ -33,9 +33,9 @@ def test_a_cycle_more_than_half_a_period_late_is_an_overrun() -> None:
     assert periods.overruns == 1
 
 
-def test_a_summary_is_kept_for_a_while() -> None:
+def test_a_summary_is_cached_for_a_second() -> None:
     periods = PeriodStatistics()
-    periods.measure(True)
+    periods.set_measuring(True)
     for i in range(10):
         periods.record(0.002 * i)
     first = periods.summary()
@@ -47,12 +47,12 @@ def test_a_summary_is_kept_for_a_while() -> None:
     assert periods.summary().max_ms == pytest.approx(982.0)
 
 
-def test_the_time_between_two_threads_that_tick_is_no_period() -> None:
+def test_the_time_between_two_ticking_threads_is_no_period() -> None:
     periods = PeriodStatistics()
     for start_s in (0.0, 7.0):
-        periods.measure(True)
+        periods.set_measuring(True)
         for i in range(10):
             periods.record(start_s + 0.002 * i)
-        periods.measure(False)
+        periods.set_measuring(False)
     assert periods.overruns == 0
     assert periods.summary() == pytest.approx((500.0, 2.0, 2.0, 2.0, 2.0))

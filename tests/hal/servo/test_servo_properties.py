@@ -1,4 +1,4 @@
-"""Whatever is streamed, the arm is never asked for too much."""
+"""Property: no stream of commands drives the arm beyond its speed and joint limits."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ chunks = st.tuples(
     st.booleans(),  # a new trajectory?
     st.lists(st.tuples(st.floats(0.005, 0.2), joints, joints), min_size=1, max_size=5),
     st.booleans(),  # final?
-    st.floats(0.02, 2.5),  # how far the points lie apart, as a speed [rad/s]
+    st.floats(0.02, 2.5),  # distance of the points, as a speed [rad/s]
 )
 events = st.one_of(
     chunks,
@@ -33,16 +33,16 @@ events = st.one_of(
 
 
 class Player:
-    """Turns drawn events into calls, as a careless sender would make them."""
+    """A careless sender that turns drawn events into calls."""
 
     def __init__(self) -> None:
         self.bench = Bench()
-        self.taken = 0
+        self.accepted = 0
         self._id, self._t_s, self._q = 0, 0.0, START
 
     def play(self, event: tuple) -> None:
         kind, *arguments = event
-        with suppress(HalError):  # refusing is the servo's right; what it sends is what is tested
+        with suppress(HalError):  # the servo may reject a command; its setpoints are under test
             getattr(self, f"_{kind}")(*arguments)
         self.bench.run(0.02)
 
@@ -57,7 +57,7 @@ class Player:
         dq = np.vstack([np.zeros(N_JOINTS), *(3.0 * rate for _, _, rate in points)])
         chunk = TrajectoryChunk(trajectory_id=self._id, t_s=t_s, q=np.array(q), dq=dq, final=final)
         self.bench.servo.stream(chunk)
-        self.taken += 1
+        self.accepted += 1
         self._t_s, self._q = float(t_s[-1]), q[-1]
 
     def _run(self, duration_s: float) -> None:
@@ -91,11 +91,11 @@ def test_no_step_is_faster_than_the_joints_and_no_setpoint_is_outside_their_limi
     assert (q <= Q_MAX).all()
 
 
-def test_the_careless_sender_of_these_tests_is_taken_seriously() -> None:
+def test_the_careless_sender_gets_trajectories_accepted() -> None:
     player = Player()
     still = (0.1, np.full(N_JOINTS, 0.1), np.zeros(N_JOINTS))
     player.play(("chunk", True, [still], False, 1.0))
     player.play(("chunk", False, [still], True, 1.0))
     player.bench.run(0.5)
-    assert player.taken == 2
+    assert player.accepted == 2
     assert player.bench.servo.status().finished

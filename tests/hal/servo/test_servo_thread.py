@@ -15,9 +15,11 @@ from hal.servo.servo import Servo
 from hal.servo.servo_thread import ServoThread
 from tests.support.hal.servo_bench import START, STEP, move
 
+pytestmark = pytest.mark.integration
+
 
 class CountingServo:
-    """Stands in for a servo: notes when it is ticked, and ends or breaks the loop after some ticks."""
+    """A servo that records the times of its ticks, and stalls once."""
 
     def __init__(self, clock: ManualClock, stall_at: int = -1) -> None:
         self.clock = clock
@@ -33,7 +35,7 @@ class CountingServo:
         if len(self.woke_s) == 60:
             self.enough.set()
         if len(self.woke_s) >= 60:
-            threading.Event().wait(0.001)  # leave the interpreter to the test
+            threading.Event().wait(0.001)  # yield the interpreter to the test
 
 
 def ticks_of(stall_at: int = -1) -> np.ndarray:
@@ -47,7 +49,7 @@ def test_it_ticks_on_absolute_deadlines() -> None:
     assert ticks_of() == pytest.approx(np.arange(60) * CONTROL_PERIOD_S)
 
 
-def test_after_a_stall_it_neither_skips_nor_bursts() -> None:
+def test_after_a_stall_it_neither_skips_nor_catches_up() -> None:
     periods = np.diff(ticks_of(stall_at=20))
     assert periods[19] == pytest.approx(0.0305)
     assert np.delete(periods, 19) == pytest.approx(np.full(58, CONTROL_PERIOD_S))
@@ -65,7 +67,7 @@ def test_a_servo_on_the_wall_clock_plays_a_trajectory_and_measures_its_periods()
     servo.stream(move(duration_s=1.0))
     while not (servo.status().finished or servo.status().reason):
         clock.sleep_until(clock.now_s() + 0.02)
-    assert thread.alive
+    assert thread.is_running
     thread.stop()
     thread.stop()
     status = servo.status()
@@ -75,7 +77,7 @@ def test_a_servo_on_the_wall_clock_plays_a_trajectory_and_measures_its_periods()
     assert 0 < status.period_ms_p50 <= status.period_ms_p999
 
 
-def test_what_a_tick_raises_latches_a_stop_and_comes_out_when_the_thread_is_ended(
+def test_an_error_in_a_tick_latches_the_stop_and_is_raised_when_the_thread_is_stopped(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     clock = WallClock()
@@ -85,7 +87,7 @@ def test_what_a_tick_raises_latches_a_stop_and_comes_out_when_the_thread_is_ende
     thread = ServoThread(servo, clock)
     thread.start()
     monkeypatch.setattr(arm, "read_state", lambda: 1 / 0)
-    while thread.alive:
+    while thread.is_running:
         clock.sleep_until(clock.now_s() + 0.005)
     status = servo.status()
     assert status.mode is ServoMode.STOPPED

@@ -95,7 +95,7 @@ def test_port_taken_by_our_own_hal_is_a_warning(monkeypatch: pytest.MonkeyPatch)
     assert row.state is State.WARN
     assert "our own HAL process" in row.seen
     assert "servo holding at 0.0 Hz" in row.seen
-    assert "nobody commands" in row.seen
+    assert "no command owner" in row.seen
     assert "./z1 run" in row.fix
 
 

@@ -72,7 +72,7 @@ def test_a_readonly_hal_publishes_states_and_frames_and_commands_nothing() -> No
         with RemoteArm(bus) as arm, RemoteCamera(bus) as camera:
             assert arm.read_state().q.shape == (7,)
             assert camera.wait_for_frame(20.0).depth_m.any()
-            with pytest.raises(LeaseError, match="only watches"):
+            with pytest.raises(LeaseError, match="monitor-only"):
                 arm.claim()
             with pytest.raises(CommandRejectedError, match="cannot stop the arm"):
                 arm.stop("a hand came near")

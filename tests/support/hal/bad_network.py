@@ -1,4 +1,4 @@
-"""A network that does one bad thing to a share of what passes; a `z1_peer.MemoryLink.mangle`."""
+"""A network with one kind of fault on a ratio of its datagrams; a `z1_peer.MemoryLink.mangle`."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 Fate = Callable[[np.random.Generator, bytes], list[tuple[int, bytes]]]
-"""What becomes of a datagram: what arrives, each after so many later ones of its direction."""
+"""Maps a datagram to the ones that arrive, each with its delay in later datagrams of the same direction."""
 
 _LONGEST = 300
 
@@ -32,21 +32,21 @@ FATES: dict[str, Fate] = {
 
 
 class BadNetwork:
-    """Hands every datagram on at once, but `share` of them to their `fate`."""
+    """A link that passes each datagram at once, or with probability `ratio` through `fate`."""
 
-    def __init__(self, fate: Fate, share: float = 0.1, seed: int = 0) -> None:
+    def __init__(self, fate: Fate, ratio: float = 0.1, seed: int = 0) -> None:
         self._fate = fate
-        self._share = share
+        self._ratio = ratio
         self._rng = np.random.default_rng(seed)
-        # Commands and answers differ in size, by which their queues are told apart.
+        # Commands and answers differ in size, which keys their queues.
         self._late: dict[int, list[tuple[int, bytes]]] = {}
         self.touched = 0
-        """Datagrams that met their fate."""
+        """Number of datagrams that went through `fate`."""
 
     def __call__(self, data: bytes) -> list[bytes]:
         late = [(left - 1, one) for left, one in self._late.get(len(data), [])]
         arriving = [(0, data)]
-        if self._rng.random() < self._share:
+        if self._rng.random() < self._ratio:
             self.touched += 1
             arriving = self._fate(self._rng, data)
         self._late[len(data)] = [(left, one) for left, one in (*late, *arriving) if left > 0]

@@ -26,7 +26,7 @@ ROOT = Path(__file__).parents[3]
 
 @dataclass
 class Hal:
-    """Both ends' handles on one running HAL."""
+    """One running HAL with its devices."""
 
     config: BusConfig
     arm: MockArm
@@ -46,7 +46,7 @@ HOME = np.append(Q_HOME, 0.0)
 
 
 def slow_motion(trajectory_id: int = 1, duration_s: float = 3.0, start: np.ndarray = HOME) -> TrajectoryChunk:
-    """Joint 1 turns 0.6 rad from `start`, smoothly."""
+    """Return a smooth motion of joint 1 by 0.6 rad from `start`."""
     s = np.linspace(0.0, 1.0, int(50 * duration_s) + 1)
     q = np.tile(start, (len(s), 1))
     dq = np.zeros((len(s), N_JOINTS))
@@ -60,7 +60,7 @@ def wait_until(condition, timeout_s: float = 10.0):
     clock, pause = WallClock(), Event()
     give_up_s = clock.now_s() + timeout_s
     while not (value := condition()):
-        assert clock.now_s() < give_up_s, "waited in vain"
+        assert clock.now_s() < give_up_s, f"the condition is false after {timeout_s} s"
         pause.wait(0.005)
     return value
 
@@ -79,7 +79,7 @@ def start_python(code: str, *arguments: object) -> subprocess.Popen:
 
 
 def end_processes(*processes: subprocess.Popen | None) -> None:
-    """Kill them, and wait until they are gone."""
+    """Kill the processes and wait for their end."""
     for process in processes:
         if process is not None:
             process.kill()
@@ -92,7 +92,7 @@ def moving(servo) -> bool:
 
 
 def set_off(arm) -> None:
-    """Begin a motion, unless one is on its way: on a busy machine one may have been given up for lost."""
+    """Start a motion if the arm holds: on a busy machine an earlier one may have ended by a late heartbeat."""
     status = arm.status()
     if status.mode is ServoMode.HOLDING:
         arm.stream(slow_motion(status.trajectory_id + 1, start=status.q_command))

@@ -1,4 +1,4 @@
-"""A servo over a mock arm on a clock moved by hand, and trajectories for it."""
+"""A servo over a mock arm on a manual clock, and trajectories for it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ STEP = np.array([0.8, 0.4, -0.5, 0.3, 0.3, -0.6, -0.4])
 
 
 class Bench:
-    """Everything a servo test needs, connected and claimed by "test"."""
+    """A clock, a mock arm and its servo, connected and claimed by "test"."""
 
     def __init__(self, *, start: np.ndarray = START, **servo_options: Any) -> None:
         self.clock = ManualClock(5.0)
@@ -36,7 +36,7 @@ class Bench:
             self.clock.advance(CONTROL_PERIOD_S)
 
     def run_until_at_rest(self, allowed_s: float = 0.4) -> float:
-        """Tick until nothing moves; return how long that took [s]."""
+        """Tick until the arm is at rest; return the duration [s]."""
         for i in range(round(allowed_s / CONTROL_PERIOD_S)):
             self.run(CONTROL_PERIOD_S)
             if self.mode in (ServoMode.HOLDING, ServoMode.STOPPED):
@@ -52,7 +52,7 @@ class Bench:
         return self.servo.status().reason
 
     def commanded(self) -> np.ndarray:
-        """(N, 7) all setpoints sent since the start."""
+        """Return all setpoints sent since the start, (N, 7) [rad]."""
         return np.array(self.sent)
 
 
@@ -65,7 +65,7 @@ def move(
     until_s: float | None = None,
     from_s: float = 0.0,
 ) -> TrajectoryChunk:
-    """A quintic from rest to rest, or the piece of it between `from_s` and `until_s` (then not final)."""
+    """Return a quintic from rest to rest, or its section between `from_s` and `until_s` (then not final)."""
     end_s = duration_s if until_s is None else until_s
     t_s = np.linspace(from_s, end_s, round((end_s - from_s) / 0.02) + 1)
     s = t_s / duration_s
@@ -81,11 +81,11 @@ def move(
 
 
 RAMP_S = 0.65
-"""How long `cruise` takes to its speed, so that full speed stays within acceleration and jerk [s]."""
+"""Time of `cruise` to its speed, with which full speed stays within acceleration and jerk [s]."""
 
 
 def cruise(joint: int, speed: float, duration_s: float, start: np.ndarray = START) -> TrajectoryChunk:
-    """One joint from rest to `speed`, smoothly, then at that speed until the buffer runs dry."""
+    """Return a motion of one joint from rest to `speed`, smoothly, then at that speed until a buffer underrun."""
     t_s = np.arange(0.0, duration_s + 1e-9, 0.01)
     q, dq = np.tile(start, (len(t_s), 1)), np.zeros((len(t_s), N_JOINTS))
     u = np.clip(t_s / RAMP_S, 0, 1)

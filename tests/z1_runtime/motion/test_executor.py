@@ -112,7 +112,7 @@ def test_a_runtime_that_falls_asleep_starves_the_servo_and_hears_of_it(bench, ex
         bench.wait(naps.pop(0) if naps else 0.0)
 
     executor.watchers.append(nap)
-    with pytest.raises((MotionError, CommandRejectedError), match="ran dry"):
+    with pytest.raises((MotionError, CommandRejectedError), match="buffer underrun"):
         executor.execute(MOVE)
     assert rests_where_it_is(bench)
 

@@ -134,6 +134,6 @@ def test_the_real_rig_is_known_by_its_name() -> None:
     assert rig.arm.config.connect_timeout_s == 1.0
     assert rig.independent
     assert rig.park is not None
-    assert rig.park.soften == rig.arm.go_passive
-    assert Guard().refusal(np.append(rig.park.q, 0.0)[None], np.append(z1.Q_HOME, 0.0)) is None
+    assert rig.park.disable_motors == rig.arm.go_passive
+    assert Guard().find_violation(np.append(rig.park.q, 0.0)[None], np.append(z1.Q_HOME, 0.0)) is None
     assert rig.call_every_tick is None

@@ -1,4 +1,4 @@
-"""Errors over the link: class, code and text travel, and the same class is raised on the other side."""
+"""Error codec of the link: class, code and text travel, and the same class is raised on the other side."""
 
 from __future__ import annotations
 
@@ -34,4 +34,7 @@ def decode_error(data: bytes) -> HalError:
             error = _KINDS[kind].__new__(_KINDS[kind], text)
             error.args, error.code = (text,), code
             return error
-    return HalError(f"the HAL process answered with an unreadable error: {data[:80]!r}.", code="unreadable_error")
+    return HalError(
+        f"bus: the HAL process answered with an unreadable error ({data[:80]!r}). Use the same version on both ends.",
+        code="unreadable_error",
+    )
