@@ -17,7 +17,7 @@ import tyro
 
 from hal.base.errors import InvalidValueError
 from models.diffusion.sampler import DiffusionConfig, DiffusionSampler
-from models.diffusion.training.labels import GRIPPERS, GripperSpec, check_grasps
+from models.diffusion.training.labels import GRIPPERS, ParallelGripperSpec, check_grasps
 from models.diffusion.training.shapes import make_shape
 from models.diffusion.training.solids import BOX, LATHE, Solid, make_part, make_solid
 from models.diffusion.training.views import ViewConfig, render_view
@@ -30,11 +30,11 @@ _PAPER, _CLOUD = (255, 255, 255), (150, 150, 150)
 _HOLDS, _LOST = (80, 150, 40), (60, 60, 220)  # blue, green, red
 _VIEW = ViewConfig(
     distance_m=(0.4, 0.4),
-    frontal_share=1.0,
+    frontal_ratio=1.0,
     frontal_elevation_deg=(12.0, 12.0),
-    upright_share=1.0,
-    one_face_share=0.0,
-    occluded_share=0.0,
+    upright_ratio=1.0,
+    one_face_ratio=0.0,
+    occluded_view_ratio=0.0,
 )
 
 
@@ -54,7 +54,7 @@ class Config:
 def main(config: Config) -> None:
     """Write one picture for each object."""
     hand = GRIPPERS[config.diffusion.gripper]
-    if not isinstance(hand, GripperSpec):
+    if not isinstance(hand, ParallelGripperSpec):
         raise InvalidValueError(f"Only parallel jaws are drawn; {hand.name!r} is none.")
     sampler = DiffusionSampler(config.diffusion)
     config.out.mkdir(parents=True, exist_ok=True)
@@ -104,7 +104,7 @@ def spread_over_directions(grasps: GraspSet, count: int) -> np.ndarray:
 
 
 def draw(
-    points: np.ndarray, grasps: GraspSet, valid: np.ndarray, hand: GripperSpec, T_camera_object: np.ndarray
+    points: np.ndarray, grasps: GraspSet, valid: np.ndarray, hand: ParallelGripperSpec, T_camera_object: np.ndarray
 ) -> np.ndarray:
     """Return a picture (360, 360, 3) of the cloud and the hands about it, upright."""
     middle = points.mean(axis=0)
@@ -137,7 +137,7 @@ def _each(grasps: GraspSet) -> list[tuple[np.ndarray, float]]:
     return list(zip(grasps.T_camera_grasps, grasps.widths_m, strict=True))
 
 
-def _hand_lines(T: np.ndarray, width_m: float, hand: GripperSpec) -> np.ndarray:
+def _hand_lines(T: np.ndarray, width_m: float, hand: ParallelGripperSpec) -> np.ndarray:
     """Return strokes (4, 2, 3): two fingers that stand a centimetre off the contacts, the bar between, the wrist."""
     half = min(width_m / 2.0 + 0.01, hand.max_width_m / 2.0)
     back = -0.6 * hand.finger_length_m

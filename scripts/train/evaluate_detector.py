@@ -28,7 +28,7 @@ from hal.base.errors import MissingFileError
 from models.detector.detector import YoloConfig, YoloModel, best_of, labels_for
 from models.detector.weights import detector_path
 from models.types import Detection
-from scripts.train.detection_measures import Tally, mask_iou, match
+from models.detector.metrics import MatchedDetections, mask_iou, match_detections
 from scripts.train.make_detection_dataset import read_labels
 from sim_twin.benchmark.episodes.scenarios import PAPER_OBJECTS, Scenario, grid
 from sim_twin.camera.d405 import INTRINSICS, measure_colour
@@ -97,21 +97,21 @@ def measure_held_out(detector: YoloModel, lavish: YoloModel, data: Path, most: i
         data: folder of the pictures.
         most: how many of them.
     """
-    looks: dict[str, Tally] = {}
+    looks: dict[str, MatchedDetections] = {}
     good = [0, 0, 0]  # at the default threshold: found and right, found, there
     images = _images(data, "val")[:most]
     for image in track(images, description="held-out pictures"):
         colour = read_image(image)
         labels = read_labels(label_file(image), colour.shape[:2])
         found = lavish.detect(colour, _LOWEST_CONFIDENCE)
-        by_box, by_mask = match(found, labels)
-        tally = looks.setdefault(image.stem.partition("_")[2], Tally())
+        by_box, by_mask = match_detections(found, labels)
+        tally = looks.setdefault(image.stem.partition("_")[2], MatchedDetections())
         numbers = [CLASSES.index(detection.label) for detection in found]
         tally.rows += list(zip(by_box, by_mask, [d.confidence for d in found], numbers, strict=True))
         tally.targets += [CLASSES.index(label.name) for label in labels]
-        hits, _ = match(given := detector.detect(colour), labels)
+        hits, _ = match_detections(given := detector.detect(colour), labels)
         good = [a + int(b) for a, b in zip(good, (hits[:, 0].sum(), len(given), len(labels)), strict=True)]
-    together = Tally(
+    together = MatchedDetections(
         rows=[row for tally in looks.values() for row in tally.rows],
         targets=[number for tally in looks.values() for number in tally.targets],
     )

@@ -20,7 +20,7 @@ import tyro
 from rich.console import Console
 
 from hal.base.errors import Z1Error
-from models.nvidia.nvidia import ENVIRONMENTS, say_licence
+from models.nvidia.nvidia import ENVIRONMENTS_FOLDER, log_licence
 
 PACKAGES = {"graspgen": "eden-grasp-gen==0.1.7", "graspgenx": "eden-graspgenx==0.1.0"}
 """What is installed for each; the adapters were tested with these."""
@@ -46,7 +46,7 @@ class Config:
 def main(config: Config) -> int:
     """Make the environment; 0 when the generator's package can be found in it."""
     console = Console(highlight=False)
-    say_licence(config.name)
+    log_licence(config.name)
     python = make_environment(config.name, find_uv(), config.torch_backend)
     console.print(f"{config.name} runs with {python}", soft_wrap=True)
     return 0
@@ -58,14 +58,14 @@ def find_uv() -> Path:
     Raises:
         InstallError: there is none.
     """
-    own = ENVIRONMENTS.parent / "uv" / "bin" / "uv"
+    own = ENVIRONMENTS_FOLDER.parent / "uv" / "bin" / "uv"
     found = shutil.which("uv") or (str(own) if own.is_file() else None)
     if found is None:
         raise InstallError("the installer `uv` was not found; install it (https://docs.astral.sh/uv), then again.")
     return Path(found)
 
 
-def make_environment(name: str, uv: Path, torch_backend: str = "", root: Path = ENVIRONMENTS) -> Path:
+def make_environment(name: str, uv: Path, torch_backend: str = "", root: Path = ENVIRONMENTS_FOLDER) -> Path:
     """Make the environment of `name` under `root` anew and return its Python; one that fails leaves nothing.
 
     Raises:

@@ -6,7 +6,7 @@
     python -m scripts.train.make_grasp_dataset --seed 2000 --view.occluded-share 1    # more, all with a part hidden
 
 Shards that exist are kept, so an interrupted run goes on where it stopped. Each is made from its own seed.
-Every label passes the exact check; one of each shape is also shaken in MuJoCo: `<shard>.shaken.json` has the outcome.
+Every label passes the exact check; one of each shape is also shaken in MuJoCo: `<shard>.simulated.json` has the outcome.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ import tyro
 from rich.progress import track
 
 from models.diffusion.cloud import prepare_cloud
-from models.diffusion.training.dynamics_test import shake_grasps
-from models.diffusion.training.labels import GRIPPERS, GripperSpec, Hand, check_grasps, find_grasps
+from models.diffusion.training.dynamics_test import simulate_grasps
+from models.diffusion.training.labels import GRIPPERS, ParallelGripperSpec, AnyGripper, check_grasps, find_grasps
 from models.diffusion.training.shapes import FAMILY_WEIGHTS, make_shape
 from models.diffusion.training.solids import Solid
 from models.diffusion.training.views import ViewConfig, render_view
@@ -44,7 +44,7 @@ class Config:
     """Shapes in a file."""
     views: int = 4
     """Views of each shape."""
-    shaken: int = 1
+    simulated: int = 1
     """Labels of each shape that are tried in dynamics; none for the beak, whose jaws are not modelled there."""
     seed: int = 1000
     """Seed of the first shard; shard k takes seed + k."""
@@ -63,9 +63,9 @@ def main(config: Config) -> None:
         if not path.exists():
             save_shard(path, make_shard(gripper, config.seed + shard, config.shapes, config.views, config.view))
         verdicts = path.with_suffix(".shaken.json")
-        if config.shaken and isinstance(gripper, GripperSpec) and not verdicts.exists():
+        if config.simulated and isinstance(gripper, ParallelGripperSpec) and not verdicts.exists():
             with np.load(path, allow_pickle=False) as arrays:
-                verdicts.write_text(json.dumps(shake_shard(dict(arrays), gripper, config.shaken)) + "\n")
+                verdicts.write_text(json.dumps(simulate_shard(dict(arrays), gripper, config.simulated)) + "\n")
 
 
 def save_shard(path: Path, arrays: dict[str, np.ndarray]) -> None:
@@ -75,7 +75,7 @@ def save_shard(path: Path, arrays: dict[str, np.ndarray]) -> None:
     partial.rename(path)
 
 
-def shake_shard(arrays: dict[str, np.ndarray], gripper: GripperSpec, count: int) -> dict:
+def simulate_shard(arrays: dict[str, np.ndarray], gripper: ParallelGripperSpec, count: int) -> dict:
     """Return how many of `count` labels of each shape were tried in dynamics, and which were lost, by family."""
     tried: Counter[str] = Counter()
     lost: Counter[str] = Counter()
@@ -84,14 +84,14 @@ def shake_shard(arrays: dict[str, np.ndarray], gripper: GripperSpec, count: int)
     ):
         solid = Solid(family=str(family), parts=parts, profiles=profiles)
         labels = T[: min(count, n)].astype(np.float64)  # a shard's labels are in random order
-        held = shake_grasps(solid, labels, check_grasps(solid, labels, gripper), gripper)
+        held = simulate_grasps(solid, labels, check_grasps(solid, labels, gripper), gripper)
         tried[solid.family] += len(held)
         lost[solid.family] += int((~held).sum())
     return {"tried": dict(tried), "lost": dict(+lost)}
 
 
 def make_shard(
-    gripper: Hand, seed: int, n_shapes: int, n_views: int, view: ViewConfig | None = None
+    gripper: AnyGripper, seed: int, n_shapes: int, n_views: int, view: ViewConfig | None = None
 ) -> dict[str, np.ndarray]:
     """Return one shard's arrays; S shapes, V = S × views.
 

@@ -54,10 +54,10 @@ def main(config: Config) -> None:
 
 def train(config: Config, manifest: Path) -> Path:
     """Train the phases that are not done, on the pictures of `manifest`; return the last checkpoint."""
-    from models.detector.training import PHASES, train_phase
+    from models.detector.training import TRAINING_PHASES, train_phase
 
     checkpoint = None
-    for number, phase in enumerate(PHASES):
+    for number, phase in enumerate(TRAINING_PHASES):
         folder = (config.run / f"{number}_{phase.imgsz}").resolve()
         checkpoint = train_phase(
             phase, data=manifest, folder=folder, start=checkpoint, seed=config.seed, threads=config.threads
@@ -99,7 +99,7 @@ def end_with_parent() -> None:
 
 def write_weights(config: Config, checkpoint: Path) -> None:
     """Write the weights of `checkpoint`, their checksum and the recipe."""
-    from models.detector.training import ARCHITECTURE, AUGMENTATION, GAINS, PHASES, read_checkpoint
+    from models.detector.training import ARCHITECTURE, AUGMENTATION, GAINS, TRAINING_PHASES, read_checkpoint
     from models.detector.weights import save_detector
 
     digest = save_detector(config.weights, read_checkpoint(checkpoint), CLASSES)
@@ -107,7 +107,7 @@ def write_weights(config: Config, checkpoint: Path) -> None:
         "architecture": ARCHITECTURE,
         "seed": config.seed,
         "processes": config.processes,
-        "phases": [asdict(phase) for phase in PHASES],
+        "phases": [asdict(phase) for phase in TRAINING_PHASES],
     }
     recipe |= {"augmentation": AUGMENTATION, "gains": GAINS}
     recipe |= {"data": json.loads((config.data / "recipe.json").read_text())}

@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 import torch
 
-from models.detector.weights import new_network, tame_ultralytics
+from models.detector.weights import new_network, disable_ultralytics_network
 
-tame_ultralytics()
+disable_ultralytics_network()
 
 
 def talkative(network, seed=0):

@@ -2,7 +2,7 @@
 
 A mount that is off by 3 mm and 1° shows an object 0.4 m away up to 10 mm beside its place: too far for a grasp. The
 depth of the jaws, laid onto their meshes by iterative closest points (point to plane), tells that place to 0.8 mm in
-the mean, 2.2 mm at worst (scripts/measure/measure_mount_sight.py: 21 looks in the twin); so a camera that was
+the mean, 2.2 mm at worst (scripts/measure/measure_extrinsics_check.py: 21 looks in the twin); so a camera that was
 knocked is made up for.
 """
 

@@ -8,10 +8,10 @@ from itertools import pairwise
 import numpy as np
 
 _ROUND = 20  # corners of a full circle
-_LEAST_M = 1e-4
+_MIN_RADIUS_M = 1e-4
 
 
-def turned_pieces(outline: np.ndarray, rounding_m: float = 0.0) -> list[np.ndarray]:
+def split_turned_solid(outline: np.ndarray, rounding_m: float = 0.0) -> list[np.ndarray]:
     """Return the corners (K, 3) of convex pieces [m] that together fill `outline` (N, 2) turned about z.
 
     Between two neighbouring corners' heights the outline is a stack of trapezia: one on the axis gives a frustum, one
@@ -27,7 +27,7 @@ def turned_pieces(outline: np.ndarray, rounding_m: float = 0.0) -> list[np.ndarr
     for between, trapezia in _strips(outline):
         z = between + rounding_m * np.array([-1.0 * (between[0] == low), 1.0 * (between[1] == high)])
         for inner, outer in trapezia:
-            if inner.max() < _LEAST_M:
+            if inner.max() < _MIN_RADIUS_M:
                 pieces.append(_frustum(outer + rounding_m, z))
             else:
                 pieces += _wedges(inner, outer, z)
@@ -41,8 +41,8 @@ def _strips(outline: np.ndarray) -> Iterator[tuple[np.ndarray, list[tuple[np.nda
     for z in pairwise(heights):
         spans = (np.minimum(start[:, 1], end[:, 1]) < z[0] + 1e-6) & (np.maximum(start[:, 1], end[:, 1]) > z[1] - 1e-6)
         a, b = start[spans], end[spans]
-        share = (np.array(z) - a[:, 1:]) / (b[:, 1:] - a[:, 1:])
-        radii = a[:, :1] + share * (b[:, :1] - a[:, :1])  # (edges, 2)
+        fraction = (np.array(z) - a[:, 1:]) / (b[:, 1:] - a[:, 1:])
+        radii = a[:, :1] + fraction * (b[:, :1] - a[:, :1])  # (edges, 2)
         radii = radii[np.argsort(radii.sum(axis=1))]
         yield np.array(z), list(zip(radii[::2], radii[1::2], strict=True))
 
@@ -62,5 +62,5 @@ def _wedges(inner: np.ndarray, outer: np.ndarray, z: np.ndarray) -> list[np.ndar
 
 
 def _circle(radius: float, angle: np.ndarray, height: float) -> np.ndarray:
-    radius = max(radius, _LEAST_M)
+    radius = max(radius, _MIN_RADIUS_M)
     return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), np.full(len(angle), height)])

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from models.diffusion.training.convex import turned_pieces
-from models.diffusion.training.labels import GraspCheck, GripperSpec
+from models.diffusion.training.convex import split_turned_solid
+from models.diffusion.training.labels import GraspCheck, ParallelGripperSpec
 from models.diffusion.training.solids import BOX, CAPSULE, TORUS, Solid
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ _START_GAP_M = 0.002
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ShakeConfig:
+class DynamicsTestConfig:
     """How hard the jaw holds and how it is shaken."""
 
     force_n: float = 40.0
@@ -38,7 +38,7 @@ class ShakeConfig:
     """Of each finger until it touches [m/s]; a 2F-140 closes with 0.015 to 0.125 m/s each (its datasheet)."""
     settle_s: float = 0.3
     """Closing and coming to rest, without gravity [s]."""
-    shake_s: float = 0.16
+    hold_s: float = 0.16
     """Time of each direction [s]."""
     acceleration_m_s2: float = 20.0
     """Felt in each direction, twice gravity [m/s²]."""
@@ -48,8 +48,8 @@ class ShakeConfig:
     """Least and greatest mass of an object [kg]."""
 
 
-def shake_grasps(
-    solid: Solid, T: np.ndarray, check: GraspCheck, gripper: GripperSpec, config: ShakeConfig | None = None
+def simulate_grasps(
+    solid: Solid, T: np.ndarray, check: GraspCheck, gripper: ParallelGripperSpec, config: DynamicsTestConfig | None = None
 ) -> np.ndarray:
     """Return which grasps `T` (N, 4, 4) in the solid's frame keep hold of it, (N,) bool.
 
@@ -66,7 +66,7 @@ def shake_grasps(
     """
     import mujoco
 
-    config = config or ShakeConfig()
+    config = config or DynamicsTestConfig()
     held = np.zeros(len(T), dtype=bool)
     tried = np.flatnonzero(np.isfinite(check.widths_m))
     if not len(tried):
@@ -82,16 +82,16 @@ def shake_grasps(
         T_grasp_object = np.linalg.inv(T[index])
         data.qpos[2:5] = T_grasp_object[:3, 3]
         mujoco.mju_mat2Quat(data.qpos[5:9], T_grasp_object[:3, :3].ravel())
-        held[index] = _survives(model, data, config)
+        held[index] = _is_held(model, data, config)
     return held
 
 
-def _survives(model: mujoco.MjModel, data: mujoco.MjData, config: ShakeConfig) -> bool:
+def _is_held(model: mujoco.MjModel, data: mujoco.MjData, config: DynamicsTestConfig) -> bool:
     import mujoco
 
     model.opt.gravity[:] = 0.0
     mujoco.mj_step(model, data, round(config.settle_s / _TIMESTEP_S))
-    steps = round(config.shake_s / _TIMESTEP_S)
+    steps = round(config.hold_s / _TIMESTEP_S)
     for axis in (2, 0, 1):
         for sign in (-1.0, 1.0):
             if not _both_touch(model, data):
@@ -108,7 +108,7 @@ def _both_touch(model: mujoco.MjModel, data: mujoco.MjData) -> bool:
     return touched.issuperset(_FINGERS)
 
 
-def _build_model(solid: Solid, gripper: GripperSpec, config: ShakeConfig) -> mujoco.MjModel:
+def _build_model(solid: Solid, gripper: ParallelGripperSpec, config: DynamicsTestConfig) -> mujoco.MjModel:
     """Return the hand in its own frame and the object as a free body; positions: two openings [m], then its pose."""
     import mujoco
 
@@ -117,7 +117,7 @@ def _build_model(solid: Solid, gripper: GripperSpec, config: ShakeConfig) -> muj
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.impratio = 10.0
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    _add_hand(spec, gripper, config)
+    _add_gripper(spec, gripper, config)
     body = spec.worldbody.add_body(name="object")
     body.add_freejoint()
     seen = set()
@@ -138,7 +138,7 @@ def _build_model(solid: Solid, gripper: GripperSpec, config: ShakeConfig) -> muj
     return model
 
 
-def _add_hand(spec: mujoco.MjSpec, gripper: GripperSpec, config: ShakeConfig) -> None:
+def _add_gripper(spec: mujoco.MjSpec, gripper: ParallelGripperSpec, config: DynamicsTestConfig) -> None:
     """Add two fingers that slide along ±y, coupled so that they close alike, and the palm they stand on."""
     import mujoco
 
@@ -192,7 +192,7 @@ def _add_part(spec: mujoco.MjSpec, body: mujoco.MjsBody, row: np.ndarray, outlin
         for start, end in pairwise(ring):
             body.add_geom(type=mujoco.mjtGeom.mjGEOM_CAPSULE, fromto=[*start, *end], size=[sizes[1], 0.0, 0.0])
     else:
-        for piece in turned_pieces(outline[: int(row[5])], row[1]):
+        for piece in split_turned_solid(outline[: int(row[5])], row[1]):
             mesh = spec.add_mesh(name=f"piece {len(spec.meshes)}", inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX)
             mesh.uservert = piece.ravel()
             body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh.name, pos=origin, quat=quat)

@@ -13,16 +13,16 @@ from torch import Tensor
 
 from models.diffusion.network import N_COORDINATES, Denoiser, decode_grasps, encode_grasps
 from models.diffusion.training.data import GraspData
-from models.diffusion.training.dynamics_test import shake_grasps
-from models.diffusion.training.labels import GripperSpec, Hand, check_grasps
+from models.diffusion.training.dynamics_test import simulate_grasps
+from models.diffusion.training.labels import ParallelGripperSpec, AnyGripper, check_grasps
 
-Progress = Callable[[int, float], None]
+ProgressCallback = Callable[[int, float], None]
 _BATCH = 16
 _CHUNK = 10 * _BATCH  # views in a file
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class JudgingConfig:
+class LabellingConfig:
     """How many grasps are judged, and how."""
 
     views: int = 10000
@@ -33,12 +33,12 @@ class JudgingConfig:
     """Ground truth knocked aside by up to 20 mm and some 20°, on each."""
     steps: int = 5
     """Denoising steps with which the samples are made."""
-    shaken_share: float = 0.01
+    simulated_fraction: float = 0.01
     """Share of what the exact check lets pass that is also tried in dynamics; what is lost there counts as invalid."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class JudgedSamples:
+class LabelledSamples:
     """Grasps with their verdicts."""
 
     views: np.ndarray
@@ -47,22 +47,22 @@ class JudgedSamples:
     """(J, K, 10)."""
     valid: Tensor
     """(J, K) 1.0 where the check passed, and the shaking for those that were shaken."""
-    shaken: int
+    simulated: int
     """Grasps that were tried in dynamics."""
     lost: int
     """Those of them that did not hold."""
 
 
-def judge_samples(
+def label_samples(
     generator: Denoiser,
     data: GraspData,
-    gripper: Hand,
+    gripper: AnyGripper,
     *,
-    config: JudgingConfig,
+    config: LabellingConfig,
     seed: int,
     folder: Path,
-    progress: Progress,
-) -> JudgedSamples:
+    progress: ProgressCallback,
+) -> LabelledSamples:
     """Return the generator's own samples and perturbed ground truth with the verdicts of check and shaking.
 
     Chunks are kept in `folder`; those of this very generator are not made again.
@@ -75,33 +75,33 @@ def judge_samples(
         path = folder / f"{start:05d}.npz"
         chunk = _load(path, digest)
         if chunk is None:
-            chunk = _judge_chunk(generator, data, gripper, views[start : start + _CHUNK], config, (seed, 2, start))
+            chunk = _label_chunk(generator, data, gripper, views[start : start + _CHUNK], config, (seed, 2, start))
             partial = path.with_suffix(".partial.npz")
             np.savez(partial, allow_pickle=False, digest=np.array(digest), **chunk)
             partial.replace(path)
         chunks.append(chunk)
         progress(start + len(chunk["valid"]), float(chunk["valid"].mean()))
     joined = {key: np.concatenate([chunk[key] for chunk in chunks]) for key in chunks[0]}
-    return JudgedSamples(
+    return LabelledSamples(
         views=views,
         grasps=torch.from_numpy(joined["grasps"]),
         valid=torch.from_numpy(joined["valid"].astype(np.float32)),
-        shaken=int(joined["shaken"].sum()),
+        simulated=int(joined["simulated"].sum()),
         lost=int(joined["lost"].sum()),
     )
 
 
-def _judge_chunk(  # noqa: PLR0917
+def _label_chunk(  # noqa: PLR0917
     generator: Denoiser,
     data: GraspData,
-    gripper: Hand,
+    gripper: AnyGripper,
     views: np.ndarray,
-    config: JudgingConfig,
+    config: LabellingConfig,
     seed: tuple[int, ...],
 ) -> dict[str, np.ndarray]:
     rng = np.random.default_rng(seed)
     torch.manual_seed(int(rng.integers(2**31)))
-    rows: dict[str, list[np.ndarray]] = {"grasps": [], "valid": [], "shaken": [], "lost": []}
+    rows: dict[str, list[np.ndarray]] = {"grasps": [], "valid": [], "simulated": [], "lost": []}
     for start in range(0, len(views), _BATCH):
         part = views[start : start + _BATCH]
         cloud = torch.from_numpy(data.clouds[part].astype(np.float32))
@@ -114,18 +114,18 @@ def _judge_chunk(  # noqa: PLR0917
             T_object = np.linalg.inv(data.T_view_object[view].astype(np.float64)) @ T_view[row]
             solid = data.solid(int(view))
             check = check_grasps(solid, T_object, gripper, widths_view[row])
-            shaken = check.valid & (rng.random(len(T_object)) < config.shaken_share)
-            lost = np.zeros_like(shaken)
-            if isinstance(gripper, GripperSpec):  # a beak's jaws are not modelled in dynamics
-                lost[shaken] = ~shake_grasps(solid, T_object[shaken], check[shaken], gripper)
-                rows["shaken"].append(shaken)
+            simulated = check.valid & (rng.random(len(T_object)) < config.simulated_fraction)
+            lost = np.zeros_like(simulated)
+            if isinstance(gripper, ParallelGripperSpec):  # a beak's jaws are not modelled in dynamics
+                lost[simulated] = ~simulate_grasps(solid, T_object[simulated], check[simulated], gripper)
+                rows["simulated"].append(simulated)
                 rows["lost"].append(lost)
             rows["valid"].append(check.valid & ~lost)
         rows["grasps"].append(v.numpy())
     nothing = np.zeros((0, config.samples + config.perturbed), dtype=bool)
     return {
         "grasps": np.concatenate(rows["grasps"]),
-        **{key: np.stack(rows[key]) if rows[key] else nothing for key in ("valid", "shaken", "lost")},
+        **{key: np.stack(rows[key]) if rows[key] else nothing for key in ("valid", "simulated", "lost")},
     }
 
 
@@ -138,7 +138,7 @@ def _load(path: Path, digest: str) -> dict[str, np.ndarray] | None:
         return {key: file[key] for key in file.files if key != "digest"}
 
 
-def _digest(generator: Denoiser, config: JudgingConfig) -> str:
+def _digest(generator: Denoiser, config: LabellingConfig) -> str:
     """Return what tells one generator and way of judging from another."""
     seen = hashlib.sha256(repr(config).encode())
     for value in generator.state_dict().values():

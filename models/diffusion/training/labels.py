@@ -10,14 +10,14 @@ from numba import njit
 
 from hal.base.errors import InvalidValueError
 from models.diffusion.training.solids import Solid, distance_at, normal_at, trace
-from models.diffusion.training.z1_gripper import LAY, BeakSpec, check_beak
+from models.diffusion.training.z1_gripper import GRIPPER_FIT, Z1GripperSpec, check_z1_grasps
 
-_LAY = np.array(LAY)
+_GRIPPER_FIT = np.array(GRIPPER_FIT)
 _SAME_CONTACT_M = 0.0015  # a pad lies on all points it would reach within this distance
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class GripperSpec:
+class ParallelGripperSpec:
     """A parallel jaw in the grasp frame: z approach, y closing, origin midway between the open fingertips."""
 
     name: str
@@ -68,10 +68,10 @@ class GripperSpec:
         return np.ascontiguousarray(grid[:, [0, 2]])
 
 
-Hand = GripperSpec | BeakSpec
-GRIPPERS: dict[str, Hand] = {
-    "agnostic": GripperSpec(name="agnostic", max_width_m=0.136),
-    "z1": BeakSpec(name="z1"),
+AnyGripper = ParallelGripperSpec | Z1GripperSpec
+GRIPPERS: dict[str, AnyGripper] = {
+    "agnostic": ParallelGripperSpec(name="agnostic", max_width_m=0.136),
+    "z1": Z1GripperSpec(name="z1"),
 }
 """Hands that weights can be trained for; `agnostic` has the opening of a Robotiq 2F-140 (its datasheet)."""
 
@@ -107,7 +107,7 @@ class GraspCheck:
 def check_grasps(
     solid: Solid,
     T: np.ndarray,
-    gripper: Hand,
+    gripper: AnyGripper,
     widths_m: np.ndarray | None = None,
     *,
     clearance_m: float = 0.0,
@@ -129,15 +129,15 @@ def check_grasps(
     cone = float(np.arctan(gripper.friction)) if cone_rad is None else cone_rad
     T = np.ascontiguousarray(T, dtype=np.float64)
     shape = (solid.parts, solid.profiles, T)
-    if isinstance(gripper, BeakSpec):
+    if isinstance(gripper, Z1GripperSpec):
         if widths_m is None:
             raise InvalidValueError(
                 f"Grasps of the hand {gripper.name!r} are checked with their widths; give widths_m (N,)."
             )
         widths = np.ascontiguousarray(np.broadcast_to(widths_m, len(T)), dtype=np.float64)
-        body = (gripper.fixed_points, gripper.turning_points)
-        faces = (gripper.fixed_face_points, gripper.turning_face_points)
-        free, antipodal, widths, offsets = check_beak(*shape, widths, *body, *faces, _LAY, clearance_m, np.cos(cone))
+        body = (gripper.stationary_points, gripper.moving_points)
+        faces = (gripper.stationary_face_points, gripper.moving_face_points)
+        free, antipodal, widths, offsets = check_z1_grasps(*shape, widths, *body, *faces, _GRIPPER_FIT, clearance_m, np.cos(cone))
     else:
         body = (gripper.body_points(), gripper.pad_points(), gripper.max_width_m / 2.0)
         free, antipodal, widths, offsets = _check(*shape, *body, clearance_m, np.cos(cone))
@@ -145,7 +145,7 @@ def check_grasps(
 
 
 def find_grasps(
-    solid: Solid, gripper: Hand, rng: np.random.Generator, n_contacts: int = 900, n_turns: int = 4
+    solid: Solid, gripper: AnyGripper, rng: np.random.Generator, n_contacts: int = 900, n_turns: int = 4
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return ground-truth grasps (N, 4, 4) of `solid` from all sides and their widths (N,) [m].
 

@@ -16,10 +16,10 @@ from torch.nn import functional as F
 
 from models.diffusion.network import Denoiser, Discriminator, encode_grasps
 from models.diffusion.training.data import GraspData, augment
-from models.diffusion.training.labelled_samples import JudgedSamples, JudgingConfig
+from models.diffusion.training.labelled_samples import LabelledSamples, LabellingConfig
 
-Network = TypeVar("Network", bound=nn.Module)
-Progress = Callable[[int, float], None]
+ModuleT = TypeVar("ModuleT", bound=nn.Module)
+ProgressCallback = Callable[[int, float], None]
 """Called with the iteration and the loss."""
 
 
@@ -33,7 +33,7 @@ class TrainingConfig:
     grasps_per_view: int = 72
     discriminator_iterations: int = 4000
     discriminator_rate: float = 1.0e-3
-    judging: JudgingConfig = field(default_factory=JudgingConfig)
+    labelling: LabellingConfig = field(default_factory=LabellingConfig)
     seed: int = 0
 
 
@@ -41,7 +41,7 @@ def train_generator(
     data: GraspData,
     config: TrainingConfig,
     checkpoint: Path,
-    progress: Progress,
+    progress: ProgressCallback,
     *,
     symmetric: bool = True,
     start_from: Denoiser | None = None,
@@ -87,11 +87,11 @@ def train_generator(
 def train_discriminator(
     generator: Denoiser,
     data: GraspData,
-    judged: JudgedSamples,
+    labelled: LabelledSamples,
     *,
     config: TrainingConfig,
     checkpoint: Path,
-    progress: Progress,
+    progress: ProgressCallback,
     symmetric: bool = True,
 ) -> Discriminator:
     """Return the discriminator; its encoder starts from the generator's. `symmetric` as for that."""
@@ -101,10 +101,10 @@ def train_discriminator(
     average.load_state_dict(model.state_dict())
 
     def loss_at(rng: np.random.Generator) -> Tensor:
-        rows = rng.integers(0, len(judged.views), 16)
-        cloud = torch.from_numpy(data.clouds[judged.views[rows]].astype(np.float32))
-        cloud, grasps = augment(cloud, judged.grasps[rows], symmetric)
-        return F.binary_cross_entropy_with_logits(model(cloud, grasps).float(), judged.valid[rows])
+        rows = rng.integers(0, len(labelled.views), 16)
+        cloud = torch.from_numpy(data.clouds[labelled.views[rows]].astype(np.float32))
+        cloud, grasps = augment(cloud, labelled.grasps[rows], symmetric)
+        return F.binary_cross_entropy_with_logits(model(cloud, grasps).float(), labelled.valid[rows])
 
     for iteration, loss in _descend(
         model,
@@ -120,7 +120,7 @@ def train_discriminator(
 
 
 def calibrate_discriminator(
-    discriminator: Discriminator, data: GraspData, judged: JudgedSamples
+    discriminator: Discriminator, data: GraspData, labelled: LabelledSamples
 ) -> tuple[float, float]:
     """Set scale and offset of the discriminator's logits so that its scores are the shares that hold; return both.
 
@@ -133,16 +133,16 @@ def calibrate_discriminator(
         logits = torch.cat(
             [
                 discriminator(torch.from_numpy(data.clouds[[view]].astype(np.float32)), grasps[None])
-                for view, grasps in zip(judged.views, judged.grasps, strict=True)
+                for view, grasps in zip(labelled.views, labelled.grasps, strict=True)
             ]
         )
-    x, y = logits.flatten().double().numpy(), judged.valid.flatten().double().numpy()
+    x, y = logits.flatten().double().numpy(), labelled.valid.flatten().double().numpy()
 
-    def surprise(parameters: np.ndarray) -> float:
+    def cross_entropy(parameters: np.ndarray) -> float:
         z = parameters[0] * x + parameters[1]
         return float(np.mean(np.logaddexp(0.0, z) - y * z))
 
-    scale, offset = (float(p) for p in minimize(surprise, [1.0, 0.0], method="Nelder-Mead").x)
+    scale, offset = (float(p) for p in minimize(cross_entropy, [1.0, 0.0], method="Nelder-Mead").x)
     last = discriminator.head.leave[-1]
     assert isinstance(last, nn.Linear)
     with torch.no_grad():
@@ -151,7 +151,7 @@ def calibrate_discriminator(
     return scale, offset
 
 
-def _seeded(make: Callable[[], Network], seed: int) -> Network:
+def _seeded(make: Callable[[], ModuleT], seed: int) -> ModuleT:
     torch.manual_seed(seed)
     return make()
 

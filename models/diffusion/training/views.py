@@ -20,54 +20,54 @@ class ViewConfig:
 
     distance_m: tuple[float, float] = (0.2, 0.6)
     """Range of the camera's distance [m]."""
-    frontal_share: float = 0.6
+    frontal_ratio: float = 0.6
     """Share of views from the front."""
     frontal_elevation_deg: tuple[float, float] = (-5.0, 30.0)
     """Range of the frontal views' elevation."""
     other_elevation_deg: tuple[float, float] = (-20.0, 85.0)
     """Range of all other views' elevation."""
-    upright_share: float = 0.55
+    upright_ratio: float = 0.55
     """Share of objects that stand; of the rest half are tilted by up to 40°, half lie anyhow."""
-    one_face_share: float = 0.2
+    one_face_ratio: float = 0.2
     """Share of views square to an object's x or y side."""
-    occluded_share: float = 0.4
+    occluded_view_ratio: float = 0.4
     """Share of views with a part hidden."""
-    hidden: tuple[float, float] = (0.1, 0.45)
+    occluded_point_ratio: tuple[float, float] = (0.1, 0.45)
     """Range of the hidden part of the points."""
     noise_per_m: tuple[float, float] = (0.002, 0.010)
     """Range of the depth noise's standard deviation over the squared distance [1/m]; 0.2 to 0.9 mm at 0.3 m."""
-    flying_share: float = 0.01
+    flying_point_ratio: float = 0.01
     """Share of points smeared back along their ray."""
 
 
 def render_view(solid: Solid, config: ViewConfig, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray] | None:
     """Return visible points (N, 3) in the camera frame and T_camera_object (4, 4); None if hardly anything shows."""
     T_camera_object = _draw_pose(config, rng)
-    rays, reach = _look(solid, T_camera_object)
+    rays, reach = _render_depth(solid, T_camera_object)
     hit = np.isfinite(reach)
     if hit.sum() < _MIN_POINTS:
         return None
     reach = reach + _depth_error(reach, hit, rng.uniform(*config.noise_per_m), rng)
     seen = _drop_grazing(solid, T_camera_object, rays, reach, hit=hit, rng=rng)
     points = (rays * reach[..., None])[seen]
-    flying = rng.random(len(points)) < config.flying_share
+    flying = rng.random(len(points)) < config.flying_point_ratio
     points[flying] *= 1.0 + rng.exponential(0.01, (flying.sum(), 1)) / np.linalg.norm(points[flying], axis=1)[:, None]
-    if rng.random() < config.occluded_share:
-        points = _hide_part(points, rng.uniform(*config.hidden), rng)
+    if rng.random() < config.occluded_view_ratio:
+        points = _occlude_part(points, rng.uniform(*config.occluded_point_ratio), rng)
     return (points, T_camera_object) if len(points) >= _MIN_POINTS else None
 
 
 def _draw_pose(config: ViewConfig, rng: np.random.Generator) -> np.ndarray:
     kind = rng.random()
     turn = Rotation.identity()
-    if kind > config.upright_share:
-        tilted = kind < (1.0 + config.upright_share) / 2.0
+    if kind > config.upright_ratio:
+        tilted = kind < (1.0 + config.upright_ratio) / 2.0
         axis = np.append(rng.normal(size=2), 0.0)
         tilt = Rotation.from_rotvec(axis / np.linalg.norm(axis) * np.radians(rng.uniform(5.0, 40.0)))
         turn = tilt if tilted else Rotation.from_quat(rng.normal(size=4))
-    one_face = rng.random() < config.one_face_share
+    one_face = rng.random() < config.one_face_ratio
     azimuth = rng.integers(4) * np.pi / 2 + rng.normal(0.0, 0.04) if one_face else rng.uniform(0.0, 2 * np.pi)
-    frontal = rng.random() < config.frontal_share
+    frontal = rng.random() < config.frontal_ratio
     elevation = np.radians(rng.uniform(*(config.frontal_elevation_deg if frontal else config.other_elevation_deg)))
     # Camera looking along +x of a level frame: image x = −y, image y = −z; then raised, swung round and rolled.
     level = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
@@ -80,7 +80,7 @@ def _draw_pose(config: ViewConfig, rng: np.random.Generator) -> np.ndarray:
     return T
 
 
-def _look(solid: Solid, T_camera_object: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _render_depth(solid: Solid, T_camera_object: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return unit rays (52, 52, 3) about the object's outline and how far (52, 52) they run to it [m]."""
     center, radius = T_camera_object[:3, 3], solid.enclosing_radius()
     middle = center[:2] / center[2]
@@ -124,7 +124,7 @@ def _drop_grazing(
     return seen
 
 
-def _hide_part(points: np.ndarray, share: float, rng: np.random.Generator) -> np.ndarray:
+def _occlude_part(points: np.ndarray, share: float, rng: np.random.Generator) -> np.ndarray:
     """Return `points` without the `share` that lies furthest to one side of the picture."""
     angle = rng.uniform(0.0, 2.0 * np.pi)
     side = points[:, :2] @ np.array([np.cos(angle), np.sin(angle)])

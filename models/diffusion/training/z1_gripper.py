@@ -1,6 +1,6 @@
 """The Z1's beak as a hand to train for: one fixed jaw, one that turns, laid around an object by its width.
 
-`pivot` is the frame of the turning jaw's axis: x towards the tips, y along the axis; the fixed jaw lies below (−z). In
+`pivot` is the frame of the moving jaw's axis: x towards the tips, y along the axis; the stationary jaw lies below (−z). In
 the grasp frame y runs from the fixed jaw to the turning one, so this hand is not its own mirror image.
 """
 
@@ -15,7 +15,7 @@ from numba import njit
 
 from models.diffusion.training.solids import distance_at, normal_at, trace
 
-FIXED_FACE = (
+STATIONARY_FACE = (
     (0.1000, -0.0090),
     (0.0751, -0.0090),
     (0.0516, -0.0177),
@@ -24,7 +24,7 @@ FIXED_FACE = (
 )
 """x, z of the fixed jaw's inner face in the pivot frame, tip first [m]; as in
 `z1_runtime/geometry/gripper_geometry.py`, from the collision meshes of the Z1's description."""
-TURNING_FACE = (
+MOVING_FACE = (
     (0.1000, -0.0090),
     (0.0762, -0.0090),
     (0.0727, -0.0083),
@@ -33,7 +33,7 @@ TURNING_FACE = (
     (0.0410, 0.0013),
 )
 """x, z of the turning jaw's inner face when the beak is closed, tip first [m]; same source."""
-FIXED_BACK = (
+STATIONARY_BACK = (
     (0.100, -0.0248),
     (0.090, -0.0279),
     (0.080, -0.0318),
@@ -42,7 +42,7 @@ FIXED_BACK = (
     (0.035, -0.0364),
 )
 """x, z of the fixed jaw's outer side [m]; measured from the same meshes."""
-TURNING_BACK = ((0.100, 0.0081), (0.090, 0.0129), (0.080, 0.0177), (0.065, 0.0230), (0.050, 0.0257), (0.035, 0.0262))
+MOVING_BACK = ((0.100, 0.0081), (0.090, 0.0129), (0.080, 0.0177), (0.065, 0.0230), (0.050, 0.0257), (0.035, 0.0262))
 """x, z of the turning jaw's outer side when closed [m]; same source."""
 HALF_WIDTH = ((0.035, 0.041), (0.060, 0.0391), (0.080, 0.0352), (0.100, 0.0307))
 """x and half the width along y of both jaws [m]; same source."""
@@ -50,7 +50,7 @@ PALM_RADIUS_M, PALM_HALF_WIDTH_M = 0.0335, 0.041
 """The palm is a cylinder about the turning jaw's axis; same source."""
 WRIST = ((-0.100, -0.030), 0.030)
 """x range and half the height and width of what lies behind the palm [m]; same source."""
-LAY = (
+GRIPPER_FIT = (
     (0.004, 0.3007, 0.0763, 0.0025, 0.0517),
     (0.012, 0.4080, 0.0753, 0.0065, 0.1052),
     (0.020, 0.5186, 0.0738, 0.0105, 0.1883),
@@ -75,7 +75,7 @@ _MAX_GAP_M = 0.025  # the object is pushed no further than this before it leans 
 
 
 @dataclass(frozen=True, kw_only=True)
-class BeakSpec:
+class Z1GripperSpec:
     """A hand whose one jaw turns towards the other, in the grasp frame: z approach, y from the fixed jaw on."""
 
     name: str
@@ -93,29 +93,29 @@ class BeakSpec:
     """Whether the hand looks the same turned over."""
 
     @cached_property
-    def fixed_points(self) -> np.ndarray:
+    def stationary_points(self) -> np.ndarray:
         """(K, 3) points on what does not move, in the pivot frame; they must not touch an object [m]."""
         angle = np.arctan2(-0.0185, 0.0281) - np.linspace(0.0, 1.5 * np.pi, 9)  # from the fixed jaw's root round
         circle = PALM_RADIUS_M * np.column_stack([np.cos(angle), np.sin(angle)])
         palm = [np.column_stack([circle[:, 0], np.full(9, y), circle[:, 1]]) for y in PALM_HALF_WIDTH_M * _ACROSS]
         (back, front), half = WRIST
         wrist = np.array([(x, y, z) for x in (back, front) for y in (-half, half) for z in (-half, 0.0, half)])
-        return np.concatenate([_across(FIXED_FACE + FIXED_BACK), *palm, wrist])
+        return np.concatenate([_across(STATIONARY_FACE + STATIONARY_BACK), *palm, wrist])
 
     @cached_property
-    def turning_points(self) -> np.ndarray:
+    def moving_points(self) -> np.ndarray:
         """(K, 3) points on the turning jaw when closed, in the pivot frame [m]."""
-        return _across(TURNING_FACE + TURNING_BACK)
+        return _across(MOVING_FACE + MOVING_BACK)
 
     @cached_property
-    def fixed_face_points(self) -> np.ndarray:
+    def stationary_face_points(self) -> np.ndarray:
         """(P, 3) points of the fixed jaw that objects lean on [m]."""
-        return _across(_denser(FIXED_FACE))
+        return _across(_denser(STATIONARY_FACE))
 
     @cached_property
-    def turning_face_points(self) -> np.ndarray:
+    def moving_face_points(self) -> np.ndarray:
         """(P, 3) points of the turning jaw that push, when closed [m]."""
-        return _across(_denser(TURNING_FACE))
+        return _across(_denser(MOVING_FACE))
 
 
 _ACROSS = np.array([-1.0, -0.5, 0.0, 0.5, 1.0])
@@ -136,11 +136,11 @@ def _denser(outline: tuple[tuple[float, float], ...], spacing_m: float = 0.006) 
 
 
 @njit(cache=True)
-def _place(T, lay, width):
+def _place(T, fit, width):
     """Return T_object_pivot (4, 4) and the opening [rad] of the beak laid around `width` for the grasp `T`."""
-    opening = np.interp(width, lay[:, 0], lay[:, 1])
-    x, z = np.interp(width, lay[:, 0], lay[:, 2]), np.interp(width, lay[:, 0], lay[:, 3])
-    tilt = np.interp(width, lay[:, 0], lay[:, 4])
+    opening = np.interp(width, fit[:, 0], fit[:, 1])
+    x, z = np.interp(width, fit[:, 0], fit[:, 2]), np.interp(width, fit[:, 0], fit[:, 3])
+    tilt = np.interp(width, fit[:, 0], fit[:, 4])
     c, s = np.cos(tilt), np.sin(tilt)
     T_grasp_pivot = np.zeros((4, 4))
     T_grasp_pivot[0, 1] = T_grasp_pivot[3, 3] = 1.0
@@ -210,7 +210,7 @@ def _close(parts, profiles, T, face, opening):
 
 
 @njit(cache=True)
-def _lean(parts, profiles, T, face, along):
+def _push_to_stationary_jaw(parts, profiles, T, face, along):
     """Move the fixed jaw along `along` (3,) until it touches: as `_close`, and how far it moved."""
     reach = np.empty(len(face))
     origins = np.empty((len(face), 3))
@@ -234,27 +234,27 @@ def _lean(parts, profiles, T, face, along):
 
 
 @njit(cache=True)
-def check_beak(parts, profiles, T, widths, fixed, turning, fixed_face, turning_face, lay, clearance, cos_cone):  # noqa: PLR0917
+def check_z1_grasps(parts, profiles, T, widths, stationary, moving, stationary_face, moving_face, fit, clearance, cos_cone):  # noqa: PLR0917
     """Return free, antipodal, widths and offsets (N,) as a `GraspCheck` holds them.
 
-    The beak is laid around the stated `widths` (N,), the fixed jaw just beside the surface. The turning jaw closes
+    The beak is laid around the stated `widths` (N,), the stationary jaw just beside the surface. The moving jaw closes
     and pushes the object, without turning it, against the fixed one.
     """
     n = len(T)
     free, antipodal = np.zeros(n, dtype=np.bool_), np.zeros(n, dtype=np.bool_)
     seen, offsets = np.full(n, np.nan), np.full(n, np.nan)
     for i in range(n):
-        T_object_pivot, opening = _place(T[i], lay, widths[i])
-        free[i] = _clear(parts, profiles, T_object_pivot, fixed, 0.0, clearance) and _clear(
-            parts, profiles, T_object_pivot, turning, opening, clearance
+        T_object_pivot, opening = _place(T[i], fit, widths[i])
+        free[i] = _clear(parts, profiles, T_object_pivot, stationary, 0.0, clearance) and _clear(
+            parts, profiles, T_object_pivot, moving, opening, clearance
         )
         if not free[i]:
             continue
-        pushed, push_normal, pushes = _close(parts, profiles, T_object_pivot, turning_face, opening)
+        pushed, push_normal, pushes = _close(parts, profiles, T_object_pivot, moving_face, opening)
         if not pushes:
             continue
         y = T[i, :3, 1].copy()
-        leant, lean_normal, leans = _lean(parts, profiles, T_object_pivot, fixed_face, y)
+        leant, lean_normal, leans = _push_to_stationary_jaw(parts, profiles, T_object_pivot, stationary_face, y)
         if not leans:
             continue
         seen[i] = np.sum((pushed - leant) * y)

@@ -150,7 +150,7 @@ def mirror_images(a, b):
 
 
 def test_a_network_with_other_anchors_looks_once(ours, monkeypatch):
-    monkeypatch.setattr("models.detector.detector.n_anchors", lambda _: -1)
+    monkeypatch.setattr("models.detector.detector.count_anchors", lambda _: -1)
     other, once = (
         YoloModel(YoloConfig(weights=ours, runtime="onnxruntime", mirrored=mirrored)) for mirrored in (True, False)
     )
@@ -247,13 +247,13 @@ def test_without_a_home_to_write_to_the_export_goes_elsewhere(ours, monkeypatch,
     file.touch()
     monkeypatch.setenv("XDG_CACHE_HOME", str(file))
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    assert modules.exported(ours).is_relative_to(tmp_path)
+    assert modules.export_to_onnx(ours).is_relative_to(tmp_path)
 
 
 @pytest.mark.parametrize("runtime", ["openvino", "onnxruntime"])
 def test_an_onnx_file_of_a_user_is_read(ours, tmp_path, runtime):
     path = tmp_path / "mine.onnx"
-    path.write_bytes(modules.exported(ours).read_bytes())
+    path.write_bytes(modules.export_to_onnx(ours).read_bytes())
     opened = open_network(path, runtime)
     assert (opened.names, opened.input_hw) == (CLASSES, SIZE)
     with pytest.raises(ValueError, match=r"mine\.onnx cannot be run by torch"):
@@ -264,7 +264,7 @@ def test_an_openvino_folder_of_a_user_is_read(ours, tmp_path):
     import openvino
 
     folder = tmp_path / "mine_openvino_model"
-    openvino.save_model(openvino.Core().read_model(modules.exported(ours)), folder / "mine.xml")
+    openvino.save_model(openvino.Core().read_model(modules.export_to_onnx(ours)), folder / "mine.xml")
     (folder / "metadata.yaml").write_text("task: segment\nnames:\n  0: bottle\n  1: cylinder\n  2: box\n")
     assert installed_runtimes(folder / "mine.xml") == ("openvino",)
     detectors = [YoloModel(YoloConfig(weights=path)) for path in (folder, folder / "mine.xml", ours)]

@@ -13,7 +13,7 @@ import torch
 from models.detector.training import (
     AUGMENTATION,
     Bf16SegmentationModel,
-    Phase,
+    TrainingPhase,
     read_checkpoint,
     train_phase,
 )
@@ -50,7 +50,7 @@ def test_a_phase_that_is_done_is_not_done_again_and_gives_finite_weights(tmp_pat
             (tmp_path / f"labels/{split}/{number}.txt").write_text("1 0.25 0.25 0.75 0.25 0.75 0.75 0.25 0.75\n")
     names = "names: {0: bottle, 1: box, 2: cylinder}\n"
     (tmp_path / "data.yaml").write_text(f"path: {tmp_path}\ntrain: images/train\nval: images/val\n{names}")
-    phase = Phase(imgsz=64, epochs=1, lr0=1e-3, lrf=0.5, warmup_epochs=0.0, batch=2)
+    phase = TrainingPhase(imgsz=64, epochs=1, lr0=1e-3, lrf=0.5, warmup_epochs=0.0, batch=2)
     threads = torch.get_num_threads()
     where = {"data": tmp_path / "data.yaml", "folder": tmp_path / "run/0", "start": None, "seed": 0}
     last = train_phase(phase, **where, threads=threads)

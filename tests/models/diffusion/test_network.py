@@ -7,7 +7,7 @@ import torch
 from models.diffusion.cloud import N_POINTS, find_view_frame, prepare_cloud
 from models.diffusion.network import Denoiser, Discriminator, decode_grasps, encode_grasps
 from models.diffusion.training.data import augment, load_shards
-from models.diffusion.training.labelled_samples import JudgingConfig, judge_samples
+from models.diffusion.training.labelled_samples import LabellingConfig, label_samples
 from models.diffusion.training.labels import GRIPPERS, check_grasps
 from models.diffusion.training.training import (
     TrainingConfig,
@@ -128,42 +128,42 @@ def test_training_lowers_the_loss_and_resumes_where_it_stopped(data, tmp_path):
 
 
 def judged_by(generator: Denoiser, data, folder, seen=lambda *_: None, **settings):
-    config = JudgingConfig(**{"views": 8, "samples": 24, "perturbed": 24, "steps": 2} | settings)
-    return judge_samples(generator, data, HAND, config=config, seed=0, folder=folder / "judged", progress=seen)
+    config = LabellingConfig(**{"views": 8, "samples": 24, "perturbed": 24, "steps": 2} | settings)
+    return label_samples(generator, data, HAND, config=config, seed=0, folder=folder / "labelled", progress=seen)
 
 
 def test_judged_samples_are_kept_for_the_generator_that_made_them(data, tmp_path, monkeypatch):
     first, other = Denoiser().eval(), Denoiser().eval()
-    judged = judged_by(first, data, tmp_path)
+    labelled = judged_by(first, data, tmp_path)
     with monkeypatch.context() as patch:
         patch.setattr("models.diffusion.training.labelled_samples.check_grasps", None)  # nothing may be judged anew
         again = judged_by(first, data, tmp_path)
-    assert torch.equal(judged.grasps, again.grasps) and torch.equal(judged.valid, again.valid)
-    assert not torch.equal(judged.grasps[:, :24], judged_by(other, data, tmp_path).grasps[:, :24])
+    assert torch.equal(labelled.grasps, again.grasps) and torch.equal(labelled.valid, again.valid)
+    assert not torch.equal(labelled.grasps[:, :24], judged_by(other, data, tmp_path).grasps[:, :24])
 
 
 def test_what_is_lost_when_shaken_counts_as_invalid(data, tmp_path, monkeypatch):
     generator = Denoiser().eval()
-    unshaken = judged_by(generator, data, tmp_path / "none", shaken_share=0.0)
+    unshaken = judged_by(generator, data, tmp_path / "none", simulated_fraction=0.0)
     monkeypatch.setattr(
         "models.diffusion.training.labelled_samples.shake_grasps", lambda _, T, *__: np.arange(len(T)) % 2 == 0
     )
-    judged = judged_by(generator, data, tmp_path / "all", shaken_share=1.0)
-    assert judged.shaken == unshaken.valid.sum() > 0
-    assert 0 < judged.lost == unshaken.valid.sum() - judged.valid.sum()
-    assert unshaken.shaken == unshaken.lost == 0
+    labelled = judged_by(generator, data, tmp_path / "all", simulated_fraction=1.0)
+    assert labelled.simulated == unshaken.valid.sum() > 0
+    assert 0 < labelled.lost == unshaken.valid.sum() - labelled.valid.sum()
+    assert unshaken.simulated == unshaken.lost == 0
 
 
 def test_calibration_takes_back_what_a_discriminator_is_too_sure_of(data, tmp_path):
     generator = Denoiser().eval()
-    judged = judged_by(generator, data, tmp_path, shaken_share=0.0)
+    labelled = judged_by(generator, data, tmp_path, simulated_fraction=0.0)
     sure, modest = Discriminator().eval(), Discriminator().eval()
     sure.head.leave[-1].bias.data.fill_(4.0)
     modest.load_state_dict(sure.state_dict())
-    scale, offset = calibrate_discriminator(modest, data, judged)
-    cloud = torch.from_numpy(data.clouds[judged.views].astype(np.float32))
-    before, after = (float(torch.sigmoid(d(cloud, judged.grasps)).mean()) for d in (sure, modest))
-    assert after == pytest.approx(float(judged.valid.mean()), abs=0.02)
+    scale, offset = calibrate_discriminator(modest, data, labelled)
+    cloud = torch.from_numpy(data.clouds[labelled.views].astype(np.float32))
+    before, after = (float(torch.sigmoid(d(cloud, labelled.grasps)).mean()) for d in (sure, modest))
+    assert after == pytest.approx(float(labelled.valid.mean()), abs=0.02)
     assert before > after + 0.2
     assert (scale, offset) != (1.0, 0.0)
 
@@ -172,13 +172,13 @@ def test_the_discriminator_learns_from_the_generators_own_judged_samples(data, t
     torch.set_num_threads(1)
     config = TrainingConfig(discriminator_iterations=20)
     generator = Denoiser().eval()
-    judged = judged_by(generator, data, tmp_path)
-    assert judged.valid[:, 24:].mean() > judged.valid[:, :24].mean()  # near ground truth against an untrained net
+    labelled = judged_by(generator, data, tmp_path)
+    assert labelled.valid[:, 24:].mean() > labelled.valid[:, :24].mean()  # near ground truth against an untrained net
     losses: list[float] = []
     train_discriminator(
         generator,
         data,
-        judged,
+        labelled,
         config=config,
         checkpoint=tmp_path / "d.pt",
         progress=lambda _, loss: losses.append(loss),

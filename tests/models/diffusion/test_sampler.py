@@ -10,14 +10,14 @@ import torch
 from scipy.special import ndtr
 from scipy.stats.qmc import discrepancy
 
-from models.diffusion.sampler import DiffusionConfig, DiffusionSampler, even_normal
+from models.diffusion.sampler import DiffusionConfig, DiffusionSampler, draw_even_normal
 from models.diffusion.selection import choose_grasps
 from models.diffusion.training.labels import GRIPPERS, check_grasps
 from models.diffusion.training.shapes import make_shape
 from models.diffusion.training.views import ViewConfig, render_view
 from models.diffusion.weights import WeightsError
 
-VIEW = ViewConfig(occluded_share=0.0, flying_share=0.0)
+VIEW = ViewConfig(occluded_view_ratio=0.0, flying_point_ratio=0.0)
 
 
 @pytest.fixture(scope="module")
@@ -96,7 +96,7 @@ def test_bfloat16_moves_grasps_by_a_fraction_of_a_millimetre(sampler, monkeypatc
     _, points, _ = a_bottle(70)
     places = []
     for quick in (False, True):
-        monkeypatch.setattr(sampler, "_quick", quick)
+        monkeypatch.setattr(sampler, "_use_bfloat16", quick)
         places.append(sampler.draw(points, 200, 0).T_camera_grasps[:, :3, 3])
     apart = np.linalg.norm(places[0] - places[1], axis=1)
     assert 0.0 < np.median(apart) < 5e-4
@@ -113,15 +113,15 @@ def test_of_many_alike_the_best_go_first_and_the_best_of_another_kind_is_not_for
 
 @pytest.mark.parametrize("n", [1, 7, 800])
 def test_noise_is_normal_and_of_the_seed(n):
-    noise = even_normal(n, 10, np.random.default_rng(3))
+    noise = draw_even_normal(n, 10, np.random.default_rng(3))
     assert noise.shape == (n, 10)
     assert np.isfinite(noise).all()
-    assert (noise == even_normal(n, 10, np.random.default_rng(3))).all()
-    assert (noise != even_normal(n, 10, np.random.default_rng(4))).any()
+    assert (noise == draw_even_normal(n, 10, np.random.default_rng(3))).all()
+    assert (noise != draw_even_normal(n, 10, np.random.default_rng(4))).any()
 
 
 def test_noise_fills_its_space_more_evenly_than_independent_draws():
-    even, independent = even_normal(800, 10, np.random.default_rng(0)), np.random.default_rng(0).normal(size=(800, 10))
+    even, independent = draw_even_normal(800, 10, np.random.default_rng(0)), np.random.default_rng(0).normal(size=(800, 10))
     assert discrepancy(ndtr(even)) < 0.5 * discrepancy(ndtr(independent))
     assert even.std(axis=0) == pytest.approx(np.ones(10), abs=0.05)
 
@@ -168,7 +168,7 @@ def test_clouds_that_cannot_be_grasped_are_refused(sampler, points, message):
 
 
 def test_nonsense_settings_and_missing_weights_are_refused(tmp_path):
-    nonsense: dict[str, Any] = {"steps": 0, "threads": 0, "temperature": 0.0, "drawn": 0.5, "device": "tpu"}
+    nonsense: dict[str, Any] = {"steps": 0, "threads": 0, "temperature": 0.0, "oversampling": 0.5, "device": "tpu"}
     for setting, value in nonsense.items():
         with pytest.raises(ValueError, match=setting):
             DiffusionConfig(**{setting: value})

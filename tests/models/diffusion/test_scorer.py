@@ -25,7 +25,7 @@ def scorer() -> GraspScorer:
 def box_view():
     rng = np.random.default_rng(7)
     solid = make_shape("box", rng)
-    seen = render_view(solid, ViewConfig(occluded_share=0.0, flying_share=0.0), rng)
+    seen = render_view(solid, ViewConfig(occluded_view_ratio=0.0, flying_point_ratio=0.0), rng)
     assert seen is not None
     return solid, *seen
 

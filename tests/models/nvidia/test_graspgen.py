@@ -16,9 +16,9 @@ import torch
 import yaml
 
 from models.nvidia.errors import GeneratorError
-from models.nvidia.nvidia import NvidiaSampler, load_here
+from models.nvidia.nvidia import NvidiaSampler, load_in_process
 from models.nvidia.process import ProcessGenerator
-from models.nvidia.torch_patches import cuda_only_if_there, drawn_from, fold_attention
+from models.nvidia.torch_patches import cuda_if_available, seed_random_numbers, fold_attention
 from models.types import GraspGenerator
 
 CLOUD = np.random.default_rng(0).uniform([-0.03, -0.05, 0.38], [0.03, 0.05, 0.42], (700, 3))
@@ -55,7 +55,7 @@ def loaded(checkpoints):
 
     def load(name: str) -> NvidiaSampler:
         if name not in made:
-            made[name] = load_here(name, checkpoints(name))
+            made[name] = load_in_process(name, checkpoints(name))
         generator = made[name]
         assert isinstance(generator, NvidiaSampler)
         return generator
@@ -88,7 +88,7 @@ def test_the_grasps_are_theirs_moved_to_the_fingertips_and_turned(name, loaded):
     ours = loaded(name).sample(CLOUD, 12, 4)
     order = np.random.default_rng(4).permutation(len(CLOUD))
     theirs = loaded(name)._sampler
-    with cuda_only_if_there(), drawn_from(4):
+    with cuda_if_available(), seed_random_numbers(4):
         T, scores, _ = theirs.sample(torch.from_numpy(CLOUD[order]).float(), -1.0, 12, remove_outliers=False)
     best_first = torch.argsort(-scores, stable=True)
     T = T[best_first].double().numpy()
@@ -162,7 +162,7 @@ def test_the_network_is_told_the_z1_s_twelve_numbers_and_the_packages_stay_as_th
     from models.nvidia.graspgenx import sweep_numbers
 
     sampler = loaded("graspgenx")._sampler
-    with cuda_only_if_there():
+    with cuda_if_available():
         told = sampler.load_gripper_input({})
     np.testing.assert_allclose(told["sweep_volume_open_and_mid"], sweep_numbers(), atol=1e-6)
     assert told["z_offset"].item() == pytest.approx(0.140)
@@ -175,7 +175,7 @@ def test_a_network_that_asks_for_more_of_the_gripper_than_there_is_is_refused(tm
 
     folder = write_graspgenx(tmp_path / "points", gripper_backbone="pointnet_repr")
     with pytest.raises(GeneratorError, match="conditioned on the gripper's 'pointnet_repr'"):
-        load_here("graspgenx", folder)
+        load_in_process("graspgenx", folder)
 
 
 @needs("graspgenx")
@@ -183,7 +183,7 @@ def test_a_graspgenx_with_a_pointnet_encoder_runs_without_compiled_ops(tmp_path)
     from tests.support.nvidia_checkpoints import write_graspgenx
 
     folder = write_graspgenx(tmp_path / "pointnet", backbone="pointnet")
-    assert len(load_here("graspgenx", folder).sample(CLOUD, 5, 0)) == 5
+    assert len(load_in_process("graspgenx", folder).sample(CLOUD, 5, 0)) == 5
 
 
 @needs("grasp_gen")
@@ -212,7 +212,7 @@ def test_a_damaged_graspgen_checkpoint_is_refused_with_its_name(damage, message,
     path = tmp_path / "damaged.yml"
     path.write_text(yaml.safe_dump(config))
     with pytest.raises(GeneratorError, match=message) as caught:
-        load_here("graspgen", path)
+        load_in_process("graspgen", path)
     assert "damaged.yml" in str(caught.value)
 
 
@@ -220,7 +220,7 @@ def test_a_damaged_graspgen_checkpoint_is_refused_with_its_name(damage, message,
 def test_half_a_graspgenx_release_is_refused(checkpoints, tmp_path):
     shutil.copytree(checkpoints("graspgenx") / "gen", tmp_path / "gen")
     with pytest.raises(GeneratorError, match=r"dis/config.yaml is missing"):
-        load_here("graspgenx", tmp_path)
+        load_in_process("graspgenx", tmp_path)
 
 
 @pytest.mark.parametrize(("name", "package"), [("graspgen", "grasp_gen"), ("graspgenx", "graspgenx")])
@@ -232,4 +232,4 @@ def test_a_missing_package_is_told_with_how_to_get_it(name, package, tmp_path):
         (tmp_path / part).mkdir()
         (tmp_path / part / "config.yaml").write_text("{}")
     with pytest.raises(GeneratorError, match=f"--extra {name}"):
-        load_here(name, tmp_path / "x.yml" if name == "graspgen" else tmp_path)
+        load_in_process(name, tmp_path / "x.yml" if name == "graspgen" else tmp_path)

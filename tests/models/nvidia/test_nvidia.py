@@ -12,7 +12,7 @@ from models.nvidia import pointnet_ops
 from models.nvidia.errors import GeneratorError
 from models.nvidia.graspgenx import Z1_GRIPPER, sweep_numbers
 from models.nvidia.nvidia import NvidiaSampler, make_nvidia_generator
-from models.nvidia.torch_patches import compiled_ops_replaced, cuda_only_if_there, drawn_from, fold_attention
+from models.nvidia.torch_patches import replace_compiled_ops, cuda_if_available, seed_random_numbers, fold_attention
 from z1_runtime.geometry import gripper_geometry
 
 CLOUD = np.random.default_rng(0).uniform([-0.03, -0.05, 0.38], [0.03, 0.05, 0.42], (500, 3))
@@ -139,7 +139,7 @@ def test_an_empty_ball_and_one_larger_than_the_cloud_are_filled():
 @pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has CUDA: nothing is patched")
 def test_cuda_calls_do_nothing_within_and_are_restored_after():
     kept = torch.Tensor.cuda, nn.Module.cuda
-    with pytest.raises(KeyError), cuda_only_if_there():
+    with pytest.raises(KeyError), cuda_if_available():
         assert torch.zeros(2).cuda().device.type == "cpu"
         assert nn.Linear(2, 2).cuda().weight.device.type == "cpu"
         raise KeyError
@@ -154,14 +154,14 @@ def test_their_random_numbers_begin_at_the_seed_and_ours_go_on_undisturbed():
     np.random.seed(5)
     drawn = []
     for _ in range(2):
-        with drawn_from(9):
+        with seed_random_numbers(9):
             drawn.append((torch.rand(1), np.random.rand()))
     assert drawn[0] == drawn[1]
     assert (torch.rand(1), np.random.rand()) == expected
 
 
 def test_the_compiled_ops_are_stood_in_for_only_while_asked():
-    with compiled_ops_replaced():
+    with replace_compiled_ops():
         from pointnet2_ops import _ext  # type: ignore[import-not-found]
 
         assert _ext is pointnet_ops
@@ -235,9 +235,9 @@ def test_a_checkpoint_that_is_not_there_and_a_python_that_is_not_are_told(name: 
 
 
 def test_the_licence_is_said_once(caplog, tmp_path):
-    from models.nvidia.graspgen import say_licence_once
+    from models.nvidia.graspgen import log_licence_once
 
-    say_licence_once.cache_clear()
+    log_licence_once.cache_clear()
     for _ in range(2):
         with pytest.raises(GeneratorError):
             make_nvidia_generator("graspgen", tmp_path / "none.yml", own_process=False)

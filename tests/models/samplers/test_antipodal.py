@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from models.obb.mvbb import fit_obb, rank_grasps
 from models.samplers.antipodal import AntipodalConfig, AntipodalSampler
-from models.samplers.surfels import estimate_normals, find_outline, guess_hidden_sides
+from models.samplers.surfels import estimate_normals, find_outline, estimate_occluded_sides
 from models.types import GraspSet
 
 UP = np.array([0.0, -1.0, 0.0])
@@ -177,6 +177,6 @@ def test_the_side_behind_a_flat_edge_is_square_to_the_face_and_behind_it():
 
     cloud = make_front_view()
     rim, outward = find_outline(cloud)
-    sides = guess_hidden_sides(cloud, KDTree(cloud), rim, outward, 0.008)
+    sides = estimate_occluded_sides(cloud, KDTree(cloud), rim, outward, 0.008)
     assert np.median(np.abs(sides.normals[:, 2])) < np.sin(np.deg2rad(5))
     assert np.median(sides.points[:, 2] - cloud[rim, 2]) == pytest.approx(0.008, abs=1e-3)

@@ -11,7 +11,7 @@ import pytest
 from models.diffusion.training.labels import GRIPPERS, check_grasps
 from models.diffusion.training.shapes import make_shape
 from models.diffusion.training.views import ViewConfig, render_view
-from models.samplers.obb_sweep import ObbSweepConfig, ObbSweepSampler, fit_snug_box
+from models.samplers.obb_sweep import ObbSweepConfig, ObbSweepSampler, fit_tightest_box
 
 HALF = np.array([0.03, 0.09, 0.05])
 CENTER = np.array([0.02, -0.01, 0.45])
@@ -53,7 +53,7 @@ def test_the_same_seed_gives_the_same_grasps_and_another_seed_others():
 
 
 def test_two_side_faces_give_a_box_along_them_and_not_along_their_hypotenuse():
-    box = fit_snug_box(corner_view())
+    box = fit_tightest_box(corner_view())
     cosines = np.abs(box.R_camera_box.T @ yaw(0.6))
     assert cosines.max(axis=0).min() > np.cos(np.deg2rad(2.0))
 
@@ -86,7 +86,7 @@ def test_most_grasps_of_boxes_and_cylinders_really_hold():
     for seed in range(6):
         rng = np.random.default_rng(500 + seed)
         solid = make_shape(("box", "cylinder")[seed % 2], rng)
-        seen = render_view(solid, ViewConfig(occluded_share=0.0), rng)
+        seen = render_view(solid, ViewConfig(occluded_view_ratio=0.0), rng)
         assert seen is not None
         points, T_camera_object = seen
         grasps = ObbSweepSampler().sample(points, 150, 0)

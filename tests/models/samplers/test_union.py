@@ -12,7 +12,7 @@ from models.diffusion.training.views import ViewConfig, render_view
 from models.factory import make_generator
 from models.samplers.antipodal import AntipodalSampler
 from models.samplers.obb_sweep import ObbSweepSampler
-from models.samplers.union import UnionSampler, find_copies
+from models.samplers.union import UnionSampler, find_duplicates
 from models.types import GraspSet
 
 CLOUD = np.random.default_rng(0).uniform([-0.03, -0.05, 0.38], [0.03, 0.05, 0.42], (200, 3))
@@ -76,14 +76,14 @@ def test_a_hand_turned_over_is_a_copy_and_one_from_elsewhere_or_across_is_not():
     far = np.eye(4)
     far[0, 3] = 0.004
     np.testing.assert_array_equal(
-        find_copies(np.stack([here, over, across, other_way, far])), [False, True, False, False, False]
+        find_duplicates(np.stack([here, over, across, other_way, far])), [False, True, False, False, False]
     )
 
 
 def test_a_copy_of_a_copy_is_kept_when_it_is_no_copy_of_what_is_kept():
     row = np.tile(np.eye(4), (3, 1, 1))
     row[:, 0, 3] = [0.0, 0.002, 0.004]
-    np.testing.assert_array_equal(find_copies(row), [False, True, False])
+    np.testing.assert_array_equal(find_duplicates(row), [False, True, False])
 
 
 def test_a_member_without_grasps_is_passed_over_but_not_all_of_them():
@@ -107,7 +107,7 @@ def test_sweep_and_diffusion_together_hold_no_worse_than_the_sweep_alone():
     for seed, family in enumerate(("lathe", "cone", "cup")):
         rng = np.random.default_rng(70 + seed)
         solid = make_shape(family, rng)
-        seen = render_view(solid, ViewConfig(occluded_share=0.0), rng)
+        seen = render_view(solid, ViewConfig(occluded_view_ratio=0.0), rng)
         assert seen is not None
         points, T_camera_object = seen
         for generator, shares in ((union, joined), (union.members[0], alone)):

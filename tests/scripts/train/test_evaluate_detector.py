@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from models.types import Detection
-from scripts.train.detection_measures import box_iou, mask_iou, match
+from models.detector.metrics import box_iou, mask_iou, match_detections
 from scripts.train.evaluate_detector import label_file, measure_empty, measure_held_out
 from scripts.train.make_detection_dataset import read_labels, to_line
 from sim_twin.detection_data.scenes import Label
@@ -100,7 +100,7 @@ def test_a_box_in_an_empty_picture_is_counted_only_above_the_threshold(data: Pat
 def test_one_label_is_hit_once_and_by_the_surest() -> None:
     mask = rectangle(100, 100, 200, 200)
     found = [detection("box", mask, 0.9), detection("box", mask, 0.8)]
-    by_box, by_mask = match(found, (Label(name="box", mask=mask),))
+    by_box, by_mask = match_detections(found, (Label(name="box", mask=mask),))
     assert by_box[0].all() and by_mask[0].all()
     assert not by_box[1].any() and not by_mask[1].any()
 

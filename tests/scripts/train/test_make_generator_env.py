@@ -33,6 +33,6 @@ def test_the_tested_package_goes_into_a_folder_of_its_own(name: str, tmp_path: P
 
 @pytest.mark.parametrize("step", ["venv", "pip"])
 def test_an_installer_that_fails_leaves_nothing_behind(step: str, tmp_path: Path):
-    with pytest.raises(InstallError, match=f"uv {step} .*failed"):
+    with pytest.raises(InstallError, match_detections=f"uv {step} .*failed"):
         make_environment("graspgenx", fake_uv(tmp_path, step), "", tmp_path / "generators")
     assert not (tmp_path / "generators" / "graspgenx").exists()

@@ -15,7 +15,7 @@ _SPAWN = get_context("spawn")
 
 
 def test_without_pictures_it_says_how_to_make_them(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match="make_detection_dataset"):
+    with pytest.raises(FileNotFoundError, match_detections="make_detection_dataset"):
         main(Config(data=tmp_path))
 
 

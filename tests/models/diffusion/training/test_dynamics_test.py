@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
 
-from models.diffusion.training.convex import turned_pieces
-from models.diffusion.training.dynamics_test import ShakeConfig, shake_grasps
-from models.diffusion.training.labels import GRIPPERS, GripperSpec, check_grasps, find_grasps
+from models.diffusion.training.convex import split_turned_solid
+from models.diffusion.training.dynamics_test import DynamicsTestConfig, simulate_grasps
+from models.diffusion.training.labels import GRIPPERS, ParallelGripperSpec, check_grasps, find_grasps
 from models.diffusion.training.shapes import make_shape
 from models.diffusion.training.solids import BOX, Solid, make_part, make_solid
 
 HAND = GRIPPERS["agnostic"]
-assert isinstance(HAND, GripperSpec)
+assert isinstance(HAND, ParallelGripperSpec)
 BRICK = make_solid("box", [make_part(BOX, (0.02, 0.03, 0.05))])
 
 
@@ -23,8 +23,8 @@ def grasp(closing: tuple, approach: tuple, at: tuple) -> np.ndarray:
     return T[None]
 
 
-def held(solid: Solid, T: np.ndarray, hand: GripperSpec = HAND, **settings) -> np.ndarray:
-    return shake_grasps(solid, T, check_grasps(solid, T, hand), hand, ShakeConfig(**settings))
+def held(solid: Solid, T: np.ndarray, hand: ParallelGripperSpec = HAND, **settings) -> np.ndarray:
+    return simulate_grasps(solid, T, check_grasps(solid, T, hand), hand, DynamicsTestConfig(**settings))
 
 
 def test_a_grasp_square_across_a_brick_survives_the_shaking():
@@ -50,8 +50,8 @@ def test_a_wedge_is_squeezed_out_where_friction_is_low():
     outline = [(0.0, 0.0), (0.045, 0.0), (0.010, 0.08), (0.0, 0.08)]
     wedge = Solid(family="cone", **dict(zip(("parts", "profiles"), _turned(outline), strict=True)))
     T = grasp((1, 0, 0), (0, 0, -1), (0.0, 0.0, 0.055))
-    assert not held(wedge, T, GripperSpec(name="slippery", max_width_m=0.136, friction=0.1)).any()
-    assert held(wedge, T, GripperSpec(name="rubber", max_width_m=0.136, friction=1.0)).all()
+    assert not held(wedge, T, ParallelGripperSpec(name="slippery", max_width_m=0.136, friction=0.1)).any()
+    assert held(wedge, T, ParallelGripperSpec(name="rubber", max_width_m=0.136, friction=1.0)).all()
 
 
 def _turned(outline: list[tuple[float, float]]) -> tuple[np.ndarray, np.ndarray]:
@@ -75,7 +75,7 @@ def test_nearly_all_labels_hold_in_dynamics_too(family):
 
 def test_a_turned_outline_is_filled_by_its_pieces():
     outline = np.array([(0.0, -0.05), (0.03, -0.05), (0.02, 0.01), (0.035, 0.05), (0.0, 0.05)])
-    volume = sum(ConvexHull(piece).volume for piece in turned_pieces(outline))
+    volume = sum(ConvexHull(piece).volume for piece in split_turned_solid(outline))
     frusta = [(0.03, 0.02, 0.06), (0.02, 0.035, 0.04)]
     wanted = sum(np.pi * h / 3.0 * (a * a + a * b + b * b) for a, b, h in frusta)
     assert volume == pytest.approx(wanted, rel=0.03)  # a polygon of 20 corners has 1.6 % less than its circle
@@ -83,7 +83,7 @@ def test_a_turned_outline_is_filled_by_its_pieces():
 
 def test_the_pieces_of_a_cup_leave_its_inside_free():
     outline = np.array([(0.0, -0.05), (0.03, -0.05), (0.04, 0.05), (0.036, 0.05), (0.026, -0.046), (0.0, -0.046)])
-    pieces = turned_pieces(outline)
+    pieces = split_turned_solid(outline)
     inside = np.array([0.0, 0.0, 0.0])
     hulls = [ConvexHull(piece) for piece in pieces]
     assert not any((h.equations[:, :3] @ inside + h.equations[:, 3] <= 1e-9).all() for h in hulls)
@@ -94,6 +94,6 @@ def test_the_pieces_of_a_cup_leave_its_inside_free():
 
 def test_rounded_edges_reach_as_far_as_the_solid():
     outline = np.array([(0.0, -0.04), (0.02, -0.04), (0.02, 0.04), (0.0, 0.04)])
-    corners = np.concatenate(turned_pieces(outline, 0.003))
+    corners = np.concatenate(split_turned_solid(outline, 0.003))
     assert np.hypot(corners[:, 0], corners[:, 1]).max() == pytest.approx(0.023)
     assert np.abs(corners[:, 2]).max() == pytest.approx(0.043)

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from models.diffusion.training.labels import GRIPPERS, GripperSpec, check_grasps, find_grasps
-from models.diffusion.training.shapes import FAMILY_WEIGHTS, KNOWN_FAMILIES, UNSEEN_FAMILIES, make_shape
+from models.diffusion.training.labels import GRIPPERS, ParallelGripperSpec, check_grasps, find_grasps
+from models.diffusion.training.shapes import FAMILY_WEIGHTS, KNOWN_FAMILIES, HELD_OUT_FAMILIES, make_shape
 from models.diffusion.training.solids import BOX, CAPSULE, LATHE, TORUS, make_part, make_solid
 from models.diffusion.training.views import ViewConfig, render_view
 
@@ -104,13 +104,13 @@ def test_ground_truth_reaches_past_its_contacts_by_what_the_hand_says():
 
 def test_a_hand_with_impossible_sizes_is_refused():
     with pytest.raises(ValueError, match="min_width_m"):
-        GripperSpec(name="odd", max_width_m=0.001)
+        ParallelGripperSpec(name="odd", max_width_m=0.001)
 
 
 def test_every_family_can_be_made_and_grasped_and_none_is_in_both_sets():
-    assert not set(KNOWN_FAMILIES) & set(UNSEEN_FAMILIES)
+    assert not set(KNOWN_FAMILIES) & set(HELD_OUT_FAMILIES)
     assert set(FAMILY_WEIGHTS) == set(KNOWN_FAMILIES)
-    for family in (*KNOWN_FAMILIES, *UNSEEN_FAMILIES):
+    for family in (*KNOWN_FAMILIES, *HELD_OUT_FAMILIES):
         solid = make_shape(family, np.random.default_rng(1))
         assert 0.015 < solid.enclosing_radius() < 0.2
         assert len(find_grasps(solid, HAND, np.random.default_rng(1), 600)[0]) > 5
@@ -119,7 +119,7 @@ def test_every_family_can_be_made_and_grasped_and_none_is_in_both_sets():
 
 
 def test_a_view_shows_the_near_side_within_the_camera_noise():
-    view = ViewConfig(distance_m=(0.3, 0.3), noise_per_m=(0.005, 0.005), flying_share=0.0, occluded_share=0.0)
+    view = ViewConfig(distance_m=(0.3, 0.3), noise_per_m=(0.005, 0.005), flying_point_ratio=0.0, occluded_view_ratio=0.0)
     points, T_camera_object = look(view, 3)
     T_object_camera = np.linalg.inv(T_camera_object)
     local = points @ T_object_camera[:3, :3].T + T_object_camera[:3, 3]
@@ -132,7 +132,7 @@ def test_a_view_shows_the_near_side_within_the_camera_noise():
 @pytest.mark.parametrize("elevation", [-20.0, 30.0])
 def test_elevation_is_the_cameras_height_over_the_object(elevation):
     view = ViewConfig(
-        frontal_share=1.0, frontal_elevation_deg=(elevation, elevation), upright_share=1.0, occluded_share=0.0
+        frontal_ratio=1.0, frontal_elevation_deg=(elevation, elevation), upright_ratio=1.0, occluded_view_ratio=0.0
     )
     eyes = []
     for seed in range(12):
@@ -145,7 +145,7 @@ def test_elevation_is_the_cameras_height_over_the_object(elevation):
 def test_depth_noise_grows_with_the_square_of_the_distance():
     def spread(distance: float) -> float:
         config = ViewConfig(
-            distance_m=(distance, distance), noise_per_m=(0.01, 0.01), flying_share=0.0, occluded_share=0.0
+            distance_m=(distance, distance), noise_per_m=(0.01, 0.01), flying_point_ratio=0.0, occluded_view_ratio=0.0
         )
         points, T_camera_object = look(config, 5)
         T = np.linalg.inv(T_camera_object)
@@ -155,7 +155,7 @@ def test_depth_noise_grows_with_the_square_of_the_distance():
 
 
 def test_occlusion_hides_the_asked_share():
-    config = ViewConfig(occluded_share=1.0, hidden=(0.35, 0.35))
-    full = look(ViewConfig(occluded_share=0.0), 2)[0]
+    config = ViewConfig(occluded_view_ratio=1.0, occluded_point_ratio=(0.35, 0.35))
+    full = look(ViewConfig(occluded_view_ratio=0.0), 2)[0]
     part = look(config, 2)[0]
     assert len(part) / len(full) == pytest.approx(0.65, abs=0.02)

@@ -12,7 +12,7 @@ from z1_runtime.geometry.gripper_mesh import gripper_shape
 from z1_runtime.grasping.beak_gripper import BeakGripper
 
 HAND = GRIPPERS["z1"]
-assert isinstance(HAND, z1_gripper.BeakSpec)
+assert isinstance(HAND, z1_gripper.Z1GripperSpec)
 BAR = make_solid("box", [make_part(BOX, (0.012, 0.015, 0.10))])
 
 
@@ -31,7 +31,7 @@ def test_the_beak_lies_as_the_runtime_lays_it():
     assert BeakConfig().contact_depth_m == z1_gripper.CONTACT_DEPTH_M
     for width in np.arange(0.004, 0.084, 0.004):
         wanted, _ = runtime.fit(np.eye(4), float(width))
-        T_pivot, opening = z1_gripper._place(np.eye(4), np.array(z1_gripper.LAY), width)
+        T_pivot, opening = z1_gripper._place(np.eye(4), np.array(z1_gripper.GRIPPER_FIT), width)
         assert T_pivot[:3, 3] == pytest.approx(wanted.T_base_pivot[:3, 3], abs=2e-3)
         assert T_pivot[:3, :3] == pytest.approx(wanted.T_base_pivot[:3, :3], abs=0.02)
         assert -opening == pytest.approx(wanted.jaw_open, abs=0.01)
@@ -39,15 +39,15 @@ def test_the_beak_lies_as_the_runtime_lays_it():
 
 
 def test_its_faces_are_those_of_the_runtime():
-    assert np.array(z1_gripper.FIXED_FACE) == pytest.approx(STATOR_FACE[: len(z1_gripper.FIXED_FACE)])
-    assert np.array(z1_gripper.TURNING_FACE) == pytest.approx(MOVER_FACE)
+    assert np.array(z1_gripper.STATIONARY_FACE) == pytest.approx(STATOR_FACE[: len(z1_gripper.STATIONARY_FACE)])
+    assert np.array(z1_gripper.MOVING_FACE) == pytest.approx(MOVER_FACE)
 
 
 def test_its_outer_sides_are_those_of_the_meshes():
     shape = gripper_shape()
     for points, outline, lowest in (
-        (shape.fixed, z1_gripper.FIXED_BACK, True),
-        (shape.mover, z1_gripper.TURNING_BACK, False),
+        (shape.fixed, z1_gripper.STATIONARY_BACK, True),
+        (shape.mover, z1_gripper.MOVING_BACK, False),
     ):
         for x, z in outline[:-1]:
             near = points[(np.abs(points[:, 0] - x) < 0.006) & (np.abs(points[:, 1]) < 0.042)]

@@ -13,11 +13,11 @@ _THRESHOLDS = np.linspace(0.5, 0.95, 10)
 
 
 @dataclass(slots=True, kw_only=True)
-class Tally:
+class MatchedDetections:
     """What was found on some pictures, and what is there."""
 
     rows: list[tuple[np.ndarray, np.ndarray, float, int]] = field(default_factory=list)
-    """Of each detection: its hits by box and by mask, see `match`, its confidence and the number of its class."""
+    """Of each detection: its hits by box and by mask, see `match_detections`, its confidence and the number of its class."""
     targets: list[int] = field(default_factory=list)
     """The number of each object's class."""
 
@@ -29,7 +29,7 @@ class Tally:
         return ap_per_class(hits, scores, np.array([row[3] for row in self.rows]), np.array(self.targets))[5]
 
 
-def match(found: list[Detection], labels: tuple[Label, ...]) -> tuple[np.ndarray, np.ndarray]:
+def match_detections(found: list[Detection], labels: tuple[Label, ...]) -> tuple[np.ndarray, np.ndarray]:
     """Return for each detection (N, 10) whether it hits a label, at each IoU from 0.5 to 0.95; by box and by mask.
 
     Each label is hit once, by the most confident detection of its class that overlaps enough.

@@ -7,8 +7,8 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from models.diffusion.training.dynamics_test import shake_grasps
-from models.diffusion.training.labels import GraspCheck, GripperSpec, Hand, check_grasps, find_grasps
+from models.diffusion.training.dynamics_test import simulate_grasps
+from models.diffusion.training.labels import GraspCheck, ParallelGripperSpec, AnyGripper, check_grasps, find_grasps
 from models.diffusion.training.solids import Solid
 from models.obb.mvbb import fit_obb, rank_grasps
 from models.types import GraspGenerator, GraspSet
@@ -49,25 +49,25 @@ class CloudResult:
     """(N,) stated minus true distance between the contacts; NaN where a pad touches nothing."""
     offsets_m: np.ndarray
     """(N,) how far off the middle the object is held."""
-    shaken_valid: np.ndarray
+    simulated_valid: np.ndarray
     """(K,) bool, which of some valid grasps held when shaken in dynamics."""
-    shaken_invalid: np.ndarray
+    simulated_invalid: np.ndarray
     """(K,) bool, the same for grasps that close on the object outside the friction cone."""
-    shaken_best: np.ndarray
+    simulated_best: np.ndarray
     """(0 or 1,) bool, whether the grasp that scored highest held."""
 
 
 def measure_cloud(
     generator: GraspGenerator,
-    gripper: Hand,
+    gripper: AnyGripper,
     solid: Solid,
     points: np.ndarray,
     *,
     T_camera_object: np.ndarray,
     samples: int,
-    shakes: int = 0,
+    simulated: int = 0,
 ) -> CloudResult:
-    """Return what `generator`'s grasps for one view are worth; `shakes` of each verdict are tried in dynamics."""
+    """Return what `generator`'s grasps for one view are worth; `simulated` of each verdict are tried in dynamics."""
     T_object_camera = np.linalg.inv(T_camera_object)
     truth = find_grasps(solid, gripper, np.random.default_rng(1))[0][:_TRUTHS]
     grasps = _sample(generator, points, samples)
@@ -89,7 +89,7 @@ def measure_cloud(
         before_faces=kept,
         width_errors_m=grasps.widths_m - check.widths_m,
         offsets_m=check.offsets_m,
-        **_shake(solid, T, check, gripper, shakes),
+        **_simulate(solid, T, check, gripper, simulated),
     )
 
 
@@ -100,18 +100,18 @@ def _sample(generator: GraspGenerator, points: np.ndarray, samples: int) -> Gras
         return GraspSet(T_camera_grasps=np.zeros((0, 4, 4)), scores=np.zeros(0), widths_m=np.zeros(0))
 
 
-def _shake(solid: Solid, T: np.ndarray, check: GraspCheck, gripper: Hand, count: int) -> dict[str, np.ndarray]:
+def _simulate(solid: Solid, T: np.ndarray, check: GraspCheck, gripper: AnyGripper, count: int) -> dict[str, np.ndarray]:
     """Return which grasps hold when shaken: some valid ones, some that close askew, and the best."""
     rng = np.random.default_rng(2)
     askew = check.free & ~check.antipodal & np.isfinite(check.widths_m)
     picks = {
-        "shaken_valid": rng.permutation(np.flatnonzero(check.valid))[:count],
-        "shaken_invalid": rng.permutation(np.flatnonzero(askew))[:count],
-        "shaken_best": np.arange(min(count, 1, len(T))),
+        "simulated_valid": rng.permutation(np.flatnonzero(check.valid))[:count],
+        "simulated_invalid": rng.permutation(np.flatnonzero(askew))[:count],
+        "simulated_best": np.arange(min(count, 1, len(T))),
     }
-    if not isinstance(gripper, GripperSpec):  # a beak's jaws are not modelled in dynamics
+    if not isinstance(gripper, ParallelGripperSpec):  # a beak's jaws are not modelled in dynamics
         picks = dict.fromkeys(picks, np.zeros(0, dtype=int))
-    return {key: shake_grasps(solid, T[pick], check[pick], gripper) for key, pick in picks.items()}  # pyright: ignore[reportArgumentType]
+    return {key: simulate_grasps(solid, T[pick], check[pick], gripper) for key, pick in picks.items()}  # pyright: ignore[reportArgumentType]
 
 
 def _coverage(truth: np.ndarray, found: np.ndarray) -> float:
@@ -143,7 +143,7 @@ def summarise(clouds: list[CloudResult]) -> dict:
         "coverage": _mean([c.coverage for c in clouds]),
         "auc": round(area_under_curve(scores, valid), 3),
         "auc_within_cloud": _mean([area_under_curve(s, v) for s, v in both]),
-        "frontal_share": _mean([_share(c.frontal) for c in clouds]),
+        "frontal_ratio": _mean([_share(c.frontal) for c in clouds]),
         "frontal_valid": _mean(np.concatenate([c.valid[c.frontal] for c in clouds])),
         "clouds_with_5_frontal_valid": _mean([np.sum(c.valid & c.frontal) >= 5 for c in clouds]),
         "mvbb_keeps_median": int(np.median(kept)),
@@ -151,7 +151,7 @@ def summarise(clouds: list[CloudResult]) -> dict:
         "mvbb_keeps_least_valid": min(int(np.sum(c.valid & c.before_faces)) for c in clouds),
         "median_width_error_m": round(float(np.median(errors)), 4) if len(errors) else None,
         "median_offset_m": round(float(np.median(offsets)), 4) if len(offsets) else None,
-        "shaken": {
+        "simulated": {
             key: {"tried": len(held), "held": int(held.sum())}
             for key in ("valid", "invalid", "best")
             if len(held := np.concatenate([getattr(c, f"shaken_{key}") for c in clouds]))

@@ -1,12 +1,12 @@
 """Trains the grasp generator and its discriminator on the CPU and writes their weights.
 
     python -m scripts.train.make_grasp_dataset
-    nice -n 19 python -m scripts.train.train_graspgen            # goes on where it stopped; an hour on one core
-    python -m scripts.train.evaluate_graspgen                    # writes models/weights/graspgen_agnostic.json
-    python -m scripts.train.train_graspgen --run out/graspgen/more --start-from models/weights/graspgen_agnostic.npz
+    nice -n 19 python -m scripts.train.train_diffusion            # goes on where it stopped; an hour on one core
+    python -m scripts.train.evaluate_diffusion                    # writes models/weights/graspgen_agnostic.json
+    python -m scripts.train.train_diffusion --run out/graspgen/more --start-from models/weights/graspgen_agnostic.npz
 
     python -m scripts.train.make_grasp_dataset --gripper z1 --shards 24
-    python -m scripts.train.train_graspgen --gripper z1 --start-from models/weights/graspgen_agnostic.npz
+    python -m scripts.train.train_diffusion --gripper z1 --start-from models/weights/graspgen_agnostic.npz
 
 Checkpoints lie in the run's folder. With the same data, seed, torch version and machine the weights come out the same.
 """
@@ -23,7 +23,7 @@ import tyro
 from rich.console import Console
 
 from models.diffusion.training.data import GraspData, load_shards
-from models.diffusion.training.labelled_samples import judge_samples
+from models.diffusion.training.labelled_samples import label_samples
 from models.diffusion.training.labels import GRIPPERS
 from models.diffusion.training.training import (
     TrainingConfig,
@@ -78,20 +78,20 @@ def main(config: Config) -> None:
         symmetric=gripper.symmetric,
         start_from=load_weights(config.start_from)[0] if config.start_from else None,
     )
-    judging, seed = config.training.judging, config.training.seed
-    judged = judge_samples(
+    labelling, seed = config.training.labelling, config.training.seed
+    labelled = label_samples(
         generator,
         data,
         gripper,
-        config=judging,
+        config=labelling,
         seed=seed,
-        folder=stem / "judged",
+        folder=stem / "labelled",
         progress=reporter.named("judged, share valid"),
     )
     discriminator = train_discriminator(
         generator,
         data,
-        judged,
+        labelled,
         config=config.training,
         checkpoint=stem.with_suffix(".discriminator.pt"),
         progress=reporter.named("discriminator"),
@@ -101,13 +101,13 @@ def main(config: Config) -> None:
     scale, offset = calibrate_discriminator(
         discriminator,
         fresh,
-        judge_samples(
+        label_samples(
             generator,
             fresh,
             gripper,
-            config=replace(judging, views=len(fresh.clouds), perturbed=0, shaken_share=0.0),
+            config=replace(labelling, views=len(fresh.clouds), perturbed=0, simulated_fraction=0.0),
             seed=seed,
-            folder=stem / "held_back" / "judged",
+            folder=stem / "held_back" / "labelled",
             progress=reporter.named("held back, share valid"),
         ),
     )
@@ -117,8 +117,8 @@ def main(config: Config) -> None:
     recipe = {"shapes": len(data.family), "views": len(data.clouds), "training": asdict(config.training)}
     recipe |= {"start_from": _origin(config.start_from), "gripper": asdict(gripper)}
     recipe |= {
-        "labels_shaken": _count_shaken(config.data / config.gripper),
-        "samples_shaken": {"tried": judged.shaken, "lost": judged.lost},
+        "labels_shaken": _count_simulated(config.data / config.gripper),
+        "samples_shaken": {"tried": labelled.simulated, "lost": labelled.lost},
     }
     recipe |= {"calibration": {"shapes": config.held_back, "scale": round(scale, 4), "offset": round(offset, 4)}}
     recipe |= {"torch": torch.__version__, "losses": reporter.curves}
@@ -144,7 +144,7 @@ def _origin(weights: Path | None) -> dict | None:
     return {"name": weights.name, "recipe": json.loads(path.read_text()) if path.exists() else None}
 
 
-def _count_shaken(folder: Path) -> dict[str, dict[str, int]]:
+def _count_simulated(folder: Path) -> dict[str, dict[str, int]]:
     """Return how many ground-truth labels were tried in dynamics and how many were lost, by family."""
     totals: dict[str, Counter[str]] = {"tried": Counter(), "lost": Counter()}
     for path in folder.glob("*.shaken.json"):

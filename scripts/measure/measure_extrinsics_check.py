@@ -1,7 +1,7 @@
 """Measures how well the jaws in the picture tell where the camera sits: looks of the twin with a mount off its drawing.
 
-    .venv/bin/python -m scripts.measure.measure_mount_sight                              # 3 mm and 1°; half a minute
-    .venv/bin/python -m scripts.measure.measure_mount_sight --error-m 0 --error-deg 0    # a right one is left alone
+    .venv/bin/python -m scripts.measure.measure_extrinsics_check                              # 3 mm and 1°; half a minute
+    .venv/bin/python -m scripts.measure.measure_extrinsics_check --error-m 0 --error-deg 0    # a right one is left alone
 
 Each look has a bottle, box or cylinder of the benchmark before it, and noise and a mount of its own.
 """
