@@ -66,6 +66,28 @@ class Intrinsics:
         """Camera matrix (3, 3)."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
+    def project(self, points: np.ndarray) -> np.ndarray:
+        """Return the pixels (N, 2), column and row, of `points` (N, 3) in the camera frame, in front of it [m]."""
+        x, y, z = points.T
+        return np.stack([self.fx * x / z + self.cx, self.fy * y / z + self.cy], axis=1)
+
+    def deproject(self, u: np.ndarray, v: np.ndarray, depth_m: np.ndarray) -> np.ndarray:
+        """Return the points (N, 3) in the camera frame of columns `u` and rows `v` (N,) at `depth_m` (N,) along z [m].
+
+        Paper: x = (u − cx) z / fx, y = (v − cy) z / fy.
+        """
+        z = np.asarray(depth_m, dtype=float)
+        points = np.empty((len(z), 3))
+        points[:, 0] = (u - self.cx) * z / self.fx
+        points[:, 1] = (v - self.cy) * z / self.fy
+        points[:, 2] = z
+        return points
+
+    def rays(self) -> np.ndarray:
+        """Return the direction (H, W, 3) of each pixel's ray in the camera frame, scaled to z = 1."""
+        v, u = np.mgrid[: self.height, : self.width]
+        return np.stack([(u - self.cx) / self.fx, (v - self.cy) / self.fy, np.ones(u.shape)], axis=-1)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RgbdFrame:

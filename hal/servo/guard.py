@@ -97,15 +97,9 @@ class Guard:
 def _joint_placements() -> np.ndarray:
     """Return (6, 4, 4) the pose of each arm joint's frame in its parent link at angle 0 (URDF); it turns about its axis
     of `AXES`."""
-    import pinocchio as pin  # pyright: ignore[reportMissingImports] - a .pth file leads to it
-
+    from hal.base.z1_model import joint_placements
     from hal.servo.guard_kernels import AXES
 
-    model = pin.buildModelFromUrdf(str(z1.urdf_path()))
-    placements = np.empty((z1.N_ARM, 4, 4))
-    for n in range(z1.N_ARM):
-        joint = model.getJointId(z1.JOINT_NAMES[n])
-        axis = model.joints[joint].shortname()[-1]
-        assert axis == AXES[n], f"{z1.JOINT_NAMES[n]} turns about {axis}"
-        placements[n] = model.jointPlacements[joint].homogeneous
+    placements, axes = joint_placements()
+    assert axes == tuple(AXES), f"the joints turn about {axes}, the compiled guard assumes {AXES}"
     return placements

@@ -30,8 +30,7 @@ class RayCaster:
     def __init__(self, model: mujoco.MjModel, intrinsics: Intrinsics, groups: Sequence[int]) -> None:
         i = intrinsics
         self._model, self._size = model, (i.height, i.width)
-        u, v = np.meshgrid(np.arange(i.width), np.arange(i.height))
-        rays = np.stack([(u - i.cx) / i.fx, (v - i.cy) / i.fy, np.ones_like(u, float)], axis=-1).reshape(-1, 3)
+        rays = i.rays().reshape(-1, 3)
         self._lengths = np.linalg.norm(rays, axis=1)
         self._rays = rays / self._lengths[:, None]
         self._groups = np.zeros(mujoco.mjNGROUP, np.uint8)

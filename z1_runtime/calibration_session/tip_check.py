@@ -17,15 +17,15 @@ from hal.base.arm import ServoedArm
 from hal.base.clock import Clock
 from hal.base.errors import InvalidValueError
 from hal.base.transforms import inverse, make_pose
+from hal.base.z1_gripper import JAW_REACH_M, STATIONARY_FACE
 from z1_runtime.calibration_session.viewpoints import plan_way
 from z1_runtime.collision.scene_collision import CollisionChecker
-from z1_runtime.geometry.gripper_geometry import JAW_REACH_M, STATOR_FACE
 from z1_runtime.geometry.kinematics import Kinematics
 from z1_runtime.motion.executor import Executor
 from z1_runtime.motion.trajectory import MotionLimits, PathFailure, straight_move
 from z1_runtime.types import JointTrajectory
 
-T_PIVOT_TIP = make_pose(np.eye(3), np.array([JAW_REACH_M, 0.0, STATOR_FACE[0, 1]]))
+T_PIVOT_TIP = make_pose(np.eye(3), np.array([JAW_REACH_M, 0.0, STATIONARY_FACE[0, 1]]))
 """(4, 4) where the closed jaws meet at their tips, in the middle of the pads' width."""
 MIN_HEIGHT_M = 0.001
 """The tip comes no nearer to the print than this [m]."""

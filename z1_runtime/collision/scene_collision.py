@@ -9,11 +9,11 @@ import numpy as np
 from hal.base import z1
 from hal.base.errors import InvalidValueError
 from hal.base.transforms import transform_points
+from hal.base.z1_gripper import moving_jaw_pose
 from hal.base.z1_shape import CAPSULES
 from z1_runtime.collision import self_collision
 from z1_runtime.collision.self_collision import MAY_MEET_SCENE, ArmPoses, Problem, first_arm_problem
 from z1_runtime.collision.voxel_grid import MAX_THRESHOLD_M, SceneIndex
-from z1_runtime.geometry.gripper_geometry import moving_jaw_pose
 from z1_runtime.geometry.gripper_mesh import gripper_shape
 from z1_runtime.geometry.kinematics import Kinematics
 from z1_runtime.types import JointTrajectory, Observation, Plane

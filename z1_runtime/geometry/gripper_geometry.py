@@ -18,22 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-STATOR_FACE = np.array(
-    [(0.1000, -0.0090), (0.0751, -0.0090), (0.0516, -0.0177), (0.0430, -0.0188), (0.0323, -0.0185), (0.0281, -0.0163)]
-)
-"""(K, 2) x, z of the fixed jaw's inner face in the pivot frame, tip first [m]; the same over the pad's width."""
-MOVER_FACE = np.array(
-    [(0.1000, -0.0090), (0.0762, -0.0090), (0.0727, -0.0083), (0.0569, -0.0012), (0.0493, 0.0009), (0.0410, 0.0013)]
-)
-"""(K, 2) x, z of the moving jaw's inner face in the pivot frame when closed, tip first [m]."""
-KNEE_RADIUS_M = 0.0767
-"""Distance of both knees from the mover's axis [m]."""
-PALM_RADIUS_M = 0.033
-"""The palm is a cylinder about the mover's axis; the mover's root reaches 0.5 mm beyond it [m]."""
-PAD_HALF_WIDTH_M = 0.026
-"""Half the pads' width along the pivot's y at the tips; 0.035 at the knees [m]."""
-JAW_REACH_M = 0.100
-"""Distance of the fingertips from the pivot [m]."""
+from hal.base.z1_gripper import KNEE_RADIUS_M, MOVING_FACE, PALM_RADIUS_M, STATIONARY_FACE
 
 _MOST_PAST = 0.15  # of an object's radius: further, and a thin one would sit behind the knees
 
@@ -66,16 +51,6 @@ class BeakConfig:
     """Least friction coefficient that must keep the object from being squeezed out; rubber on plastic has 0.5 to 1."""
 
 
-def moving_jaw_pose(jaw: float | np.ndarray) -> np.ndarray:
-    """Return T_pivot_mover (..., 4, 4) at mover angle `jaw` [rad]: a turn about the pivot's y axis."""
-    c, s = np.cos(jaw), np.sin(jaw)
-    T_pivot_mover = np.zeros((*np.shape(jaw), 4, 4))
-    T_pivot_mover[..., 0, 0] = T_pivot_mover[..., 2, 2] = c
-    T_pivot_mover[..., 0, 2], T_pivot_mover[..., 2, 0] = s, -s
-    T_pivot_mover[..., 1, 1] = T_pivot_mover[..., 3, 3] = 1.0
-    return T_pivot_mover
-
-
 class Lay(NamedTuple):
     """How the beak lies around N discs, in the pivot's xz plane."""
 
@@ -105,8 +80,8 @@ def lay_around(widths: np.ndarray, fronts: np.ndarray, config: BeakConfig) -> La
     distance = np.maximum(knees, palm_m + np.minimum(fronts, r))
     above, contact = _gap(distance, r)
     centre = _polar(distance, above)
-    on_stator = _nearest(STATOR_FACE, centre)
-    on_mover = _turned(_nearest(MOVER_FACE, _turned(centre, -contact)), contact)
+    on_stator = _nearest(STATIONARY_FACE, centre)
+    on_mover = _turned(_nearest(MOVING_FACE, _turned(centre, -contact)), contact)
     across = on_mover - on_stator
     across /= np.linalg.norm(across, axis=1, keepdims=True)
     along = np.column_stack([across[:, 1], -across[:, 0]])
@@ -128,7 +103,7 @@ def lay_around(widths: np.ndarray, fronts: np.ndarray, config: BeakConfig) -> La
 
 def _gap(distance: np.ndarray, r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return where discs at `distance` (N,) that touch both jaws lie above the pivot's x (N,), and the opening (N,)."""
-    above, below = _bearing(STATOR_FACE, distance, r, 1.0), _bearing(MOVER_FACE, distance, r, -1.0)
+    above, below = _bearing(STATIONARY_FACE, distance, r, 1.0), _bearing(MOVING_FACE, distance, r, -1.0)
     return above, above - below
 
 

@@ -8,12 +8,8 @@ from functools import cache
 import numpy as np
 
 from hal.base import z1
-from z1_runtime.geometry.gripper_geometry import PALM_RADIUS_M
-
-T_PIVOT_STATOR = np.eye(4)
-"""(4, 4) the fixed jaw's mesh in the pivot frame: the mover's joint on the stator, of the URDF."""
-T_PIVOT_STATOR[0, 3] = -0.049
-T_PIVOT_STATOR.setflags(write=False)
+from hal.base.transforms import transform_points
+from hal.base.z1_gripper import PALM_RADIUS_M, T_PIVOT_STATIONARY_JAW
 
 _SPACING_M = 0.0085
 _JAW_SPACING_M = 0.005  # jaws pass the object within millimetres, and its edges must not slip between two points
@@ -36,16 +32,16 @@ class GripperShape:
 def gripper_shape(spacing_m: float = _SPACING_M) -> GripperShape:
     """Return the points, sampled from the STL meshes about `spacing_m` apart [m], closer on the jaws."""
     T_pivot_flange = np.linalg.inv(z1.T_FLANGE_PIVOT)
-    stator = _moved(T_PIVOT_STATOR, _mesh_surface("z1_GripperStator", spacing_m))
-    jaw = _moved(T_PIVOT_STATOR, _mesh_surface("z1_GripperStator", _JAW_SPACING_M))
+    stator = transform_points(T_PIVOT_STATIONARY_JAW, _mesh_surface("z1_GripperStator", spacing_m))
+    jaw = transform_points(T_PIVOT_STATIONARY_JAW, _mesh_surface("z1_GripperStator", _JAW_SPACING_M))
     stator = np.concatenate([stator[stator[:, 0] < PALM_RADIUS_M], jaw[jaw[:, 0] >= PALM_RADIUS_M]])
     # The housing is hollow; nothing gets inside without crossing what surrounds it
     inside = (np.hypot(stator[:, 0], stator[:, 2]) < PALM_RADIUS_M - 0.002) & (np.abs(stator[:, 1]) < 0.026)
-    wrist = _moved(T_pivot_flange, _mesh_surface("z1_Link06", spacing_m))
-    camera = _moved(
+    wrist = transform_points(T_pivot_flange, _mesh_surface("z1_Link06", spacing_m))
+    camera = transform_points(
         T_pivot_flange @ z1.T_FLANGE_CAMERA, _box_surface(z1.CAMERA_HOUSING_LOW, z1.CAMERA_HOUSING_HIGH, spacing_m)
     )
-    bracket = _moved(T_pivot_flange, _bracket(spacing_m))
+    bracket = transform_points(T_pivot_flange, _bracket(spacing_m))
     fixed = np.concatenate([stator[~inside], wrist, camera, bracket])
     mover = _mesh_surface("z1_GripperMover", _JAW_SPACING_M)
     shape = GripperShape(fixed=spread_first(fixed), mover=spread_first(mover))
@@ -58,10 +54,6 @@ def spread_first(vertices: np.ndarray) -> np.ndarray:
     """Return `vertices` (V, 3) reordered so that any head of the list is spread over the whole: hits come early."""
     order = np.random.default_rng(0).permutation(len(vertices))
     return vertices[order]
-
-
-def _moved(T: np.ndarray, points: np.ndarray) -> np.ndarray:
-    return points @ T[:3, :3].T + T[:3, 3]
 
 
 def _mesh_surface(name: str, spacing_m: float) -> np.ndarray:

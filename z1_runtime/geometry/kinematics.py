@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import pinocchio as pin  # pyright: ignore[reportMissingImports] - a .pth file leads to it
 
 from hal.base import z1
 from hal.base.errors import Z1Error
 from hal.base.transforms import check_pose, error_twist, inverse, pose_error
+from hal.base.z1_model import ForwardKinematics
 from z1_runtime.types import IkMethod
 
 POSITION_TOLERANCE_M = 0.002
@@ -76,50 +76,18 @@ class IkResult:
     """Angle between the pose asked and the pose reached [rad]."""
 
 
-class Kinematics:
-    """The Z1's kinematics from its URDF; base = link00, pivot = `hal.base.z1.T_FLANGE_PIVOT` on link06.
+class Kinematics(ForwardKinematics):
+    """The Z1's forward and inverse kinematics; base = link00, pivot = `hal.base.z1.T_FLANGE_PIVOT` on link06.
 
     One object belongs to one thread: pinocchio's scratch memory is inside.
     """
 
     def __init__(self) -> None:
-        # The prebuilt solver compiles itself on import; only who plans pays for it
+        super().__init__()
+        # The prebuilt solver compiles itself on import; only a planner pays for it
         from ssik.prebuilt.unitree import z1_ik
 
         self._analytic = z1_ik.solve
-        self._model = pin.buildModelFromUrdf(str(z1.urdf_path()))
-        flange = self._model.frames[self._model.getFrameId("link06")]
-        placement = flange.placement * pin.SE3(np.array(z1.T_FLANGE_PIVOT))
-        self._pivot_id = self._model.addFrame(
-            pin.Frame("pivot", flange.parentJoint, self._model.getFrameId("link06"), placement, pin.FrameType.OP_FRAME)
-        )
-        self._links = {
-            frame.name: index for index, frame in enumerate(self._model.frames) if frame.type == pin.FrameType.BODY
-        }
-        self._data = self._model.createData()
-        self._q_full = np.zeros(self._model.nq)
-
-    def pivot(self, q: np.ndarray) -> np.ndarray:
-        """Return T_base_pivot (4, 4) at arm joints `q` (6,)."""
-        return self._frame(q, self._pivot_id)
-
-    def flange(self, q: np.ndarray) -> np.ndarray:
-        """Return T_base_flange (4, 4) at arm joints `q` (6,)."""
-        return self._frame(q, self._links["link06"])
-
-    def link_poses(self, q: np.ndarray) -> dict[str, np.ndarray]:
-        """Return T_base_link (4, 4) of every URDF link at joints `q` (7,), by link name.
-
-        The names are `link00` to `link06`, `gripperStator` and `gripperMover`, and the massless `world`.
-        """
-        pin.framesForwardKinematics(self._model, self._data, np.asarray(q, dtype=np.float64))
-        return {name: self._data.oMf[index].homogeneous for name, index in self._links.items()}
-
-    def jacobian(self, q: np.ndarray) -> np.ndarray:
-        """Return the (6, 6) Jacobian of the pivot at `q` (6,): linear rows first, then angular, in base axes."""
-        self._q_full[: z1.N_ARM] = q
-        frame = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
-        return pin.computeFrameJacobian(self._model, self._data, self._q_full, self._pivot_id, frame)[:, : z1.N_ARM]
 
     def solve(self, T_base_pivot: np.ndarray) -> list[np.ndarray]:
         """Return every arm joint vector (6,) inside the limits that puts the pivot at `T_base_pivot` (4, 4).
@@ -193,11 +161,6 @@ class Kinematics:
                 )
             qs[i] = q = nearest
         return qs
-
-    def _frame(self, q: np.ndarray, frame_id: int) -> np.ndarray:
-        self._q_full[: z1.N_ARM] = q
-        pin.forwardKinematics(self._model, self._data, self._q_full)
-        return pin.updateFramePlacement(self._model, self._data, frame_id).homogeneous
 
     def _best_least_squares(self, T_base_pivot: np.ndarray, q_near: np.ndarray) -> IkResult:
         tries: list[tuple[float, np.ndarray, float, float]] = []

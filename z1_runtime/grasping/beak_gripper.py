@@ -8,7 +8,8 @@ import numpy as np
 
 from hal.base import z1
 from hal.base.errors import Z1Error
-from z1_runtime.geometry.gripper_geometry import BeakConfig, Lay, lay_around, moving_jaw_pose
+from hal.base.z1_gripper import moving_jaw_pose
+from z1_runtime.geometry.gripper_geometry import BeakConfig, Lay, lay_around
 
 _WIDTHS_M = np.arange(0.002, 0.120, 0.0005)
 

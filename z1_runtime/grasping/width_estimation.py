@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from z1_runtime.geometry.gripper_geometry import PAD_HALF_WIDTH_M
+from hal.base.z1_gripper import PAD_HALF_WIDTH_M
 
 _PALM_HALF_WIDTH_M = 0.041
 _ASIDE_M = 0.005  # what stands out this far beside the width still goes towards the palm between the jaws

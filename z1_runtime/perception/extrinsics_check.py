@@ -19,8 +19,7 @@ from hal.base import z1
 from hal.base.errors import InvalidValueError
 from hal.base.messages import RgbdFrame
 from hal.base.transforms import inverse, transform_points
-from z1_runtime.geometry.gripper_geometry import moving_jaw_pose
-from z1_runtime.geometry.gripper_mesh import T_PIVOT_STATOR
+from hal.base.z1_gripper import T_FLANGE_STATIONARY_JAW, moving_jaw_pose
 from z1_runtime.perception.self_filter import SelfFilter
 
 _SAMPLES = {"z1_GripperStator": 50_000, "z1_GripperMover": 30_000}
@@ -113,8 +112,7 @@ class ExtrinsicsCheck:
         v, u = np.nonzero((frame.depth_m > 0.0) & (frame.depth_m <= reach))
         chosen = np.random.default_rng(0).permutation(len(u))[: self.points]
         u, v, i = u[chosen], v[chosen], frame.intrinsics
-        z = frame.depth_m[v, u].astype(np.float64)
-        return np.column_stack([(u - i.cx) / i.fx * z, (v - i.cy) / i.fy * z, z])
+        return i.deproject(u, v, frame.depth_m[v, u])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -150,7 +148,7 @@ def _step(at: np.ndarray, normals: np.ndarray, offsets: np.ndarray) -> np.ndarra
 def _jaws(jaw: float) -> tuple[np.ndarray, np.ndarray]:
     """Return surface points (N, 3) [m] and outward normals (N, 3) of both jaws in the flange frame."""
     (fixed, fixed_normals), (mover, mover_normals) = (_sampled(name) for name in _SAMPLES)
-    T_stator, T_mover = z1.T_FLANGE_PIVOT @ T_PIVOT_STATOR, z1.T_FLANGE_PIVOT @ moving_jaw_pose(jaw)
+    T_stator, T_mover = T_FLANGE_STATIONARY_JAW, z1.T_FLANGE_PIVOT @ moving_jaw_pose(jaw)
     points = [transform_points(T_stator, fixed), transform_points(T_mover, mover)]
     return np.concatenate(points), np.concatenate(
         [fixed_normals @ T_stator[:3, :3].T, mover_normals @ T_mover[:3, :3].T]

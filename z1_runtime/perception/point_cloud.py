@@ -69,20 +69,13 @@ def continuous_pixels(depth_m: np.ndarray, step_ratio: float = 0.03, min_neighbo
 def back_project(depth_m: np.ndarray, intrinsics: Intrinsics, pixels: np.ndarray) -> np.ndarray:
     """Return the (N, 3) points of the (H, W) bool `pixels`, row by row.
 
-    Paper: x = (u − cx) z / fx, y = (v − cy) z / fy, z = d(u, v), with u the column and v the row.
-
     Raises:
         ValueError: depth and pixels differ in shape.
     """
     if depth_m.shape != pixels.shape:
         raise InvalidValueError(f"depth {depth_m.shape} and pixels {pixels.shape} must have the same shape.")
     v, u = np.nonzero(pixels)
-    z = depth_m[pixels].astype(float)
-    points = np.empty((len(z), 3))
-    points[:, 0] = (u - intrinsics.cx) * z / intrinsics.fx
-    points[:, 1] = (v - intrinsics.cy) * z / intrinsics.fy
-    points[:, 2] = z
-    return points
+    return intrinsics.deproject(u, v, depth_m[pixels])
 
 
 def box_pixels(shape: tuple[int, ...], box_px: tuple[int, int, int, int]) -> np.ndarray:

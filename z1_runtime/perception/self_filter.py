@@ -11,7 +11,7 @@ from hal.base import z1
 from hal.base.errors import InvalidValueError
 from hal.base.messages import Intrinsics, RgbdFrame
 from hal.base.transforms import inverse, transform_points
-from z1_runtime.geometry.gripper_geometry import moving_jaw_pose
+from hal.base.z1_gripper import moving_jaw_pose
 from z1_runtime.geometry.gripper_mesh import gripper_shape
 
 _IN_FRONT_M = 0.02  # nearer to the lens than this are only camera and bracket themselves
@@ -50,8 +50,7 @@ class SelfFilter:
         )
         points = points[points[:, 2] > _IN_FRONT_M]
         points = points[np.argsort(points[:, 2], kind="stable")]  # the farthest is drawn last, and stays
-        u = np.rint(intrinsics.fx * points[:, 0] / points[:, 2] + intrinsics.cx).astype(int)
-        v = np.rint(intrinsics.fy * points[:, 1] / points[:, 2] + intrinsics.cy).astype(int)
+        u, v = np.rint(intrinsics.project(points)).astype(int).T
         radius_px = np.ceil(self.margin_m * intrinsics.fx / points[:, 2]).astype(int)
         reach = np.zeros((intrinsics.height, intrinsics.width), np.float32)
         seen = (u > -radius_px) & (u < intrinsics.width + radius_px) & (v > -radius_px)

@@ -206,9 +206,7 @@ class GraspSelector:
 def draw_can(T_base_camera: np.ndarray, radius_m: float = 0.03, height_m: float = 0.15) -> RgbdFrame:
     """Return an exact frame, from `T_base_camera` (4, 4), of an upright can 0.48 m in front of the base."""
     intrinsics = Intrinsics(width=640, height=480, fx=393.0, fy=393.0, cx=319.5, cy=239.5)
-    v, u = np.mgrid[: intrinsics.height, : intrinsics.width]
-    rays = np.stack([(u - intrinsics.cx) / intrinsics.fx, (v - intrinsics.cy) / intrinsics.fy, np.ones(u.shape)], -1)
-    d = rays @ T_base_camera[:3, :3].T  # per metre of depth, in the base frame
+    d = intrinsics.rays() @ T_base_camera[:3, :3].T  # per metre of depth, in the base frame
     eye = T_base_camera[:3, 3] - [0.48, 0.0, 0.0]
 
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -23,8 +23,10 @@ class FeedForward:
     def __init__(self) -> None:
         import pinocchio as pin  # pyright: ignore[reportMissingImports] - a .pth file leads to it
 
+        from hal.base.z1_model import rigid_body_model
+
         self._gravity = pin.computeGeneralizedGravity
-        self._model = pin.buildModelFromUrdf(str(z1.urdf_path()))
+        self._model = rigid_body_model()
         self._data = self._model.createData()
         self._dry = _FRICTION_SHARE * np.array(self._model.friction)
         self._viscous = np.array(self._model.damping)

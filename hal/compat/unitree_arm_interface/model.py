@@ -45,8 +45,10 @@ class Z1Model:
     ) -> None:
         import pinocchio as pin  # pyright: ignore[reportMissingImports] - a .pth file leads to it
 
+        from hal.base.z1_model import rigid_body_model
+
         self._pin = pin
-        full = pin.buildModelFromUrdf(str(z1.urdf_path()))
+        full = rigid_body_model()
         model = pin.buildReducedModel(full, [full.getJointId("jointGripper")], pin.neutral(full))
         flange = full.frames[full.getFrameId("link06")]
         # The URDF's gripper is part of its last joint: only link06 itself stays.
@@ -64,7 +66,9 @@ class Z1Model:
     def with_gripper(cls) -> Z1Model:
         """Return the model of the arm with its own gripper, closed, by the URDF's masses; its end is the pivot."""
         made = cls(np.array([PIVOT_M, 0.0, 0.0]))
-        full = made._pin.buildModelFromUrdf(str(z1.urdf_path()))
+        from hal.base.z1_model import rigid_body_model
+
+        full = rigid_body_model()
         made._model = made._pin.buildReducedModel(full, [full.getJointId("jointGripper")], made._pin.neutral(full))
         made._data = made._model.createData()
         return made

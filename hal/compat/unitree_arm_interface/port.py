@@ -11,7 +11,7 @@ _NAME = "unitree_arm_interface"
 
 def install() -> None:
     """Let `import unitree_arm_interface` give ours from now on, whatever lies on the path."""
-    sys.modules[_NAME] = sys.modules[f"hal.{_NAME}"]
+    sys.modules[_NAME] = sys.modules[f"hal.compat.{_NAME}"]
 
 
 @contextmanager

@@ -143,7 +143,7 @@ def test_the_real_worker_needs_nothing_of_ours_but_its_room_and_tells_what_is_mi
         "import sys, runpy; sys.argv = ['w', 'graspgen', 'none.yml']\n"
         f"try: runpy.run_path({str(WORKER)!r}, run_name='__main__')\n"
         "except SystemExit as end:\n"
-        "    ours = [m for m in ('numba', 'scipy', 'hal', 'z1_runtime') if m in sys.modules]\n"
+        "    ours = [m for m in ('numba', 'scipy', 'pinocchio', 'z1_runtime') if m in sys.modules]\n"
         "    print(ours, end.code, file=sys.stderr)"
     )
     done = subprocess.run([PYTHON, "-I", "-c", code], capture_output=True, check=True, stdin=subprocess.DEVNULL)

@@ -8,14 +8,8 @@ import trimesh
 
 from hal.base import z1
 from hal.base.transforms import inverse
-from z1_runtime.geometry.gripper_geometry import (
-    JAW_REACH_M,
-    KNEE_RADIUS_M,
-    MOVER_FACE,
-    STATOR_FACE,
-    BeakConfig,
-    moving_jaw_pose,
-)
+from hal.base.z1_gripper import JAW_REACH_M, KNEE_RADIUS_M, MOVING_FACE, STATIONARY_FACE, moving_jaw_pose
+from z1_runtime.geometry.gripper_geometry import BeakConfig
 from z1_runtime.grasping.beak_gripper import BeakGripper, WidthError
 
 TIGHT = BeakConfig(clearance_m=0.0)
@@ -59,7 +53,7 @@ def contact_frame(config: BeakConfig) -> np.ndarray:
     return T
 
 
-@pytest.mark.parametrize(("face", "name", "offset"), [(STATOR_FACE, "stator", 0.0), (MOVER_FACE, "mover", 0.0)])
+@pytest.mark.parametrize(("face", "name", "offset"), [(STATIONARY_FACE, "stator", 0.0), (MOVING_FACE, "mover", 0.0)])
 def test_the_measured_faces_lie_on_the_meshes(face, name, offset, request):
     points = request.getfixturevalue(name)
     middle = points[np.abs(points[:, 1]) < 0.02][:, [0, 2]]
@@ -68,9 +62,9 @@ def test_the_measured_faces_lie_on_the_meshes(face, name, offset, request):
 
 
 def test_knees_and_tips_are_where_the_faces_say():
-    assert np.hypot(*MOVER_FACE[1]) == pytest.approx(KNEE_RADIUS_M, abs=1e-3)
-    assert np.hypot(*STATOR_FACE[1]) == pytest.approx(KNEE_RADIUS_M, abs=1.5e-3)
-    assert STATOR_FACE[0, 0] == MOVER_FACE[0, 0] == JAW_REACH_M
+    assert np.hypot(*MOVING_FACE[1]) == pytest.approx(KNEE_RADIUS_M, abs=1e-3)
+    assert np.hypot(*STATIONARY_FACE[1]) == pytest.approx(KNEE_RADIUS_M, abs=1.5e-3)
+    assert STATIONARY_FACE[0, 0] == MOVING_FACE[0, 0] == JAW_REACH_M
 
 
 @pytest.mark.parametrize("width", [0.01, 0.02, 0.03, 0.04, 0.05, 0.06, 0.07, 0.08])
@@ -112,7 +106,7 @@ def test_the_fingertips_pass_the_contacts_and_the_squeeze_is_level(width):
     config = BeakConfig()
     gripper = BeakGripper(config)
     grasp, _ = gripper.fit(contact_frame(config), width)
-    tip = grasp.T_base_touch @ np.array([*STATOR_FACE[0, :1], 0.0, STATOR_FACE[0, 1], 1.0])
+    tip = grasp.T_base_touch @ np.array([*STATIONARY_FACE[0, :1], 0.0, STATIONARY_FACE[0, 1], 1.0])
     assert 0.015 < tip[2] < 0.030
     assert abs(gripper.squeeze_out_angle(width)) < np.deg2rad(12)
 

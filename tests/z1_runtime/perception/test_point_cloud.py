@@ -5,6 +5,7 @@ import pytest
 from scipy.spatial import KDTree
 
 from hal.base.messages import Intrinsics
+from hal.base.transforms import transform_points
 from tests.support.tabletop_scene import INTRINSICS, Box, T_base_camera, cast
 from z1_runtime.perception import point_cloud
 
@@ -64,10 +65,8 @@ def test_a_hole_continues_nobody_and_its_rim_stays():
 def test_transform_applies_the_pose_and_its_inverse_undoes_it():
     T = T_base_camera()
     points = np.random.default_rng(0).normal(size=(50, 3))
-    np.testing.assert_allclose(point_cloud.transform(T, np.zeros((1, 3)))[0], T[:3, 3])
-    np.testing.assert_allclose(
-        point_cloud.transform(np.linalg.inv(T), point_cloud.transform(T, points)), points, atol=1e-12
-    )
+    np.testing.assert_allclose(transform_points(T, np.zeros((1, 3)))[0], T[:3, 3])
+    np.testing.assert_allclose(transform_points(np.linalg.inv(T), transform_points(T, points)), points, atol=1e-12)
 
 
 def test_the_depth_clip_keeps_what_lies_between_the_percentiles():

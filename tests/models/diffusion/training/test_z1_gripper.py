@@ -3,11 +3,12 @@
 import numpy as np
 import pytest
 
+from hal.base.z1_gripper import MOVING_FACE, STATIONARY_FACE
 from models.diffusion.training import z1_gripper
 from models.diffusion.training.labels import GRIPPERS, check_grasps, find_grasps
 from models.diffusion.training.shapes import make_shape
 from models.diffusion.training.solids import BOX, make_part, make_solid
-from z1_runtime.geometry.gripper_geometry import MOVER_FACE, STATOR_FACE, BeakConfig
+from z1_runtime.geometry.gripper_geometry import BeakConfig
 from z1_runtime.geometry.gripper_mesh import gripper_shape
 from z1_runtime.grasping.beak_gripper import BeakGripper
 
@@ -39,8 +40,8 @@ def test_the_beak_lies_as_the_runtime_lays_it():
 
 
 def test_its_faces_are_those_of_the_runtime():
-    assert np.array(z1_gripper.STATIONARY_FACE) == pytest.approx(STATOR_FACE[: len(z1_gripper.STATIONARY_FACE)])
-    assert np.array(z1_gripper.MOVING_FACE) == pytest.approx(MOVER_FACE)
+    assert np.array(z1_gripper.FIXED_FACE) == pytest.approx(STATIONARY_FACE[: len(z1_gripper.FIXED_FACE)])
+    assert np.array(z1_gripper.TURNING_FACE) == pytest.approx(MOVING_FACE)
 
 
 def test_its_outer_sides_are_those_of_the_meshes():
