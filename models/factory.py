@@ -38,7 +38,9 @@ class GeneratorOptions:
 
     def __post_init__(self) -> None:
         if self.process not in get_args(Process):
-            raise InvalidValueError(f"generator_process is {self.process!r}; allowed is in (this process) or own.", code="generator_process")
+            raise InvalidValueError(
+                f"generator_process is {self.process!r}; allowed is in (this process) or own.", code="generator_process"
+            )
 
 
 def split_generator_name(name: str) -> tuple[str, ...]:

@@ -74,8 +74,8 @@ def verify_sha256(path: Path, make_command: str) -> str:
     actual, expected = sha256_of(path), next(iter(checksum.read_text().split()), "nothing")
     if actual != expected:
         raise WeightsError(
-            f"{path.name} has SHA-256 {actual[:12]}…, {checksum.name} says {expected[:12]}…: the file is damaged or was "
-            "exchanged; restore both from the repository.",
+            f"{path.name} has SHA-256 {actual[:12]}…, {checksum.name} says {expected[:12]}…: the file is damaged or "
+            "was exchanged; restore both from the repository.",
             code="weights_damaged",
         )
     return actual

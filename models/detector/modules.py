@@ -1,4 +1,4 @@
-"""Detectors as torch modules, from this project's weights or an ultralytics checkpoint, and their cached ONNX export."""
+"""Detectors as torch modules, from own weights or an ultralytics checkpoint, and their cached ONNX export."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from models.detector.weights import CAMERA_HW, TRAIN_COMMAND, load_detector, disable_ultralytics_network
+from models.detector.weights import CAMERA_HW, TRAIN_COMMAND, disable_ultralytics_network, load_detector
 from models.torch_threads import single_threaded_workers
-from models.weights_file import WeightsError, verify_sha256, sha256_of
+from models.weights_file import WeightsError, sha256_of, verify_sha256
 
 MODULE_SUFFIXES = (".npz", ".pt")
 """Files with a network's weights; the others hold a graph for a runtime."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from models.detector.weights import ARCHITECTURE, new_network, disable_ultralytics_network
+from models.detector.weights import ARCHITECTURE, disable_ultralytics_network, new_network
 
 disable_ultralytics_network()  # ultralytics reads the variables when it is imported
 

@@ -45,7 +45,9 @@ class DiffusionConfig:
         if not 1 <= self.steps <= 100:
             raise InvalidValueError(f"diffusion: steps is {self.steps}; allowed is 1 to 100.", code="diffusion_steps")
         if not 1 <= self.threads <= 64:
-            raise InvalidValueError(f"diffusion: threads is {self.threads}; allowed is 1 to 64.", code="diffusion_threads")
+            raise InvalidValueError(
+                f"diffusion: threads is {self.threads}; allowed is 1 to 64.", code="diffusion_threads"
+            )
         if not 0.0 < self.temperature <= 1.5:
             raise InvalidValueError(
                 f"diffusion: temperature is {self.temperature}; allowed is above 0, up to 1.5.",
@@ -57,7 +59,8 @@ class DiffusionConfig:
             )
         if self.device not in get_args(Device):
             raise InvalidValueError(
-                f"diffusion: device is {self.device!r}; allowed: {', '.join(get_args(Device))}.", code="diffusion_device"
+                f"diffusion: device is {self.device!r}; allowed: {', '.join(get_args(Device))}.",
+                code="diffusion_device",
             )
 
 

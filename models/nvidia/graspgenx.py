@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 import json
 import logging
+import math
 import os
 import tempfile
 from collections.abc import Iterator
@@ -19,38 +20,66 @@ from typing import Any
 
 import numpy as np
 
+from hal.base.z1_gripper import (
+    JAW_REACH_M,
+    KNEE_RADIUS_M,
+    PAD_HALF_WIDTH_M,
+    PALM_HALF_WIDTH_M,
+    PALM_RADIUS_M,
+    T_PIVOT_STATIONARY_JAW,
+)
 from models.nvidia.errors import GeneratorError
 from models.nvidia.nvidia import NvidiaSampler, load_guarded, require_package
 from models.types import GraspGenerator
 
 _LOG = logging.getLogger(__name__)
 
-Z1_GRIPPER: dict[str, Any] = {
-    "open": {"jointGripper": -0.88},
-    "close": {"jointGripper": 0.0},
-    "fingertip": [0.0, 0.0, 0.140],
-    "sweep_volume": {
-        "extents": [0.065, 0.052, 0.058],
-        "offset": [0.0, 0.0, 0.111],
-        "extents2": [0.033, 0.052, 0.065],
-        "offset2": [0.0, 0.0, 0.114],
-    },
-    "standoff": [0.0, 0.03],
-    "bbox": [[-0.05, -0.041, 0.0], [0.05, 0.041, 0.149]],
-    "symmetric": False,
-    "type": "revolute_2f",
-}
+_WIDEST_M = 0.065
+"""Widest object that the Z1 gripper is opened for [m]."""
+_BODY_HALF_M = 0.05  # half the size of the bounding box along the closing axis
+
+
+def _make_sweep_box(jaw_rad: float) -> tuple[list[float], list[float]]:
+    """Return extents and centre of the volume between both jaws at an opening, rounded to millimetres [m]."""
+    axis = -float(T_PIVOT_STATIONARY_JAW[0, 3])
+    width = round(2.0 * KNEE_RADIUS_M * math.sin(jaw_rad / 2.0), 3)
+    palm, tips = axis + PALM_RADIUS_M, round(axis + JAW_REACH_M * math.cos(jaw_rad / 2.0), 3)
+    return [width, 2.0 * PAD_HALF_WIDTH_M, round(tips - palm, 3)], [0.0, 0.0, round((tips + palm) / 2.0, 3)]
+
+
+def _describe_z1() -> dict[str, Any]:
+    jaw_rad = 2.0 * math.asin(_WIDEST_M / 2.0 / KNEE_RADIUS_M)
+    (extents, offset), (half_extents, half_offset) = _make_sweep_box(jaw_rad), _make_sweep_box(jaw_rad / 2.0)
+    tips = offset[2] + extents[2] / 2.0
+    reach = JAW_REACH_M - float(T_PIVOT_STATIONARY_JAW[0, 3])
+    return {
+        "open": {"jointGripper": -round(jaw_rad, 2)},
+        "close": {"jointGripper": 0.0},
+        "fingertip": [0.0, 0.0, round(tips, 3)],
+        "sweep_volume": {"extents": extents, "offset": offset, "extents2": half_extents, "offset2": half_offset},
+        "standoff": [0.0, 0.03],
+        "bbox": [[-_BODY_HALF_M, -PALM_HALF_WIDTH_M, 0.0], [_BODY_HALF_M, PALM_HALF_WIDTH_M, round(reach, 3)]],
+        "symmetric": False,
+        "type": "revolute_2f",
+    }
+
+
+Z1_GRIPPER = _describe_z1()
 """The Z1's gripper in GraspGenX's format (`config.json`): z approach, x closing, origin at GripperStator [m].
 
-From the URDF and the faces measured in `z1_runtime/geometry/gripper_geometry.py`, to which a test holds it: the
-mover's axis is 49 mm beyond the origin, the palm reaches 33 mm and the fingertips 100 mm beyond that, the knees that
-touch stand 76.7 mm from the axis, pads are 52 mm wide. `BeakGripper` lays the beak so that both jaws lean alike on an
-object, hence a box symmetric in x: as wide as the knees are apart at the opening for the widest object (65 mm, 0.88
-rad), and at half of it; from the palm to the leaning fingertips. Boston Dynamics' Spot, the other one-jawed gripper
-in their collection, is described likewise.
+The runtime fits the gripper so that both jaws lean alike on an object, hence a box symmetric in x: as wide as the knees
+are apart at the opening for the widest object, and at half of it; from the palm to the leaning fingertips. Boston
+Dynamics' Spot, the other gripper with one moving jaw in GraspGenX's collection, is described likewise.
 """
 _NAME = "unitree_z1"
-_BOX_CONDITIONINGS = ("none", "z_offset", "gripper_type", "sweep_volume", "sweep_volume_v2", "gripper_type+sweep_volume_v2")
+_BOX_CONDITIONINGS = (
+    "none",
+    "z_offset",
+    "gripper_type",
+    "sweep_volume",
+    "sweep_volume_v2",
+    "gripper_type+sweep_volume_v2",
+)
 
 
 @cache
@@ -74,7 +103,7 @@ def load(folder: Path) -> GraspGenerator:
     require_package("graspgenx", "graspgenx")
     log_licence_once()
     from models.nvidia import pointnet_ops
-    from models.nvidia.torch_patches import replace_compiled_ops, cuda_if_available, fold_attention
+    from models.nvidia.torch_patches import cuda_if_available, fold_attention, replace_compiled_ops
 
     with replace_compiled_ops():  # GraspGenX compiles them at import
         from graspgenx.grasp_server import GraspGenXSampler  # pyright: ignore[reportMissingImports]

@@ -156,7 +156,9 @@ def load_guarded(name: str, load: Callable[[], Any]) -> Any:
         return load()
     except GeneratorError as err:
         raise GeneratorError(f"{name} cannot be loaded: {err}", code=err.code) from err
-    except Exception as err:  # NVIDIA's loaders raise AssertionError, KeyError, RuntimeError, UnpicklingError and others
+    except (
+        Exception
+    ) as err:  # NVIDIA's loaders raise AssertionError, KeyError, RuntimeError, UnpicklingError and others
         raise GeneratorError(
             f"{name} cannot be loaded: {type(err).__name__}: {err}", code="checkpoint_unreadable"
         ) from err

@@ -61,9 +61,7 @@ def fit_obb(
     elif method == "min_volume":
         axes = min_volume_axes(points, axes)
     elif method != "pca":
-        raise InvalidValueError(
-            f"Unknown box method {method!r}; choose pca, min_volume or upright.", code="box_method"
-        )
+        raise InvalidValueError(f"Unknown box method {method!r}; choose pca, min_volume or upright.", code="box_method")
     along = axes.T @ points.T  # (3, N), a contiguous row for each axis
     low, high = np.array([_ends(row, percentile) for row in along]).T
     middle, half = (low + high) / 2, np.maximum(high - low, _THICKNESS_FLOOR_M) / 2

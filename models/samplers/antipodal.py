@@ -9,7 +9,7 @@ from scipy.spatial import KDTree
 
 from hal.base.errors import InvalidValueError
 from models.samplers.gripper_models import choose_candidates, count_points
-from models.samplers.surfels import Surfels, estimate_normals, find_outline, estimate_occluded_sides, smooth_normals
+from models.samplers.surfels import Surfels, estimate_normals, estimate_occluded_sides, find_outline, smooth_normals
 from models.types import GraspSet, check_request
 
 
@@ -126,7 +126,9 @@ class AntipodalSampler:
             ),
         )
 
-    def _draw_candidates(self, surfels: Surfels, points: np.ndarray, count: int, rng: np.random.Generator) -> _Candidates:
+    def _draw_candidates(
+        self, surfels: Surfels, points: np.ndarray, count: int, rng: np.random.Generator
+    ) -> _Candidates:
         """Draw `count` closing lines, even over the contacts, and an approach about each."""
         config = self.config
         first, second = _find_antipodal_pairs(surfels, config)

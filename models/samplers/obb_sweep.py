@@ -141,8 +141,8 @@ class ObbSweepSampler:
         if not sweeps:
             mm = " × ".join(f"{1e3 * extent:.0f}" for extent in box.extents_m)
             raise InvalidValueError(
-                f"The object's box is {mm} mm; the gripper opens {1e3 * self.config.max_width_m:.0f} mm. Give a cloud of "
-                "one object that is narrower on some visible side.",
+                f"The object's box is {mm} mm; the gripper opens {1e3 * self.config.max_width_m:.0f} mm. Give a cloud "
+                "of one object that is narrower on some visible side.",
                 code="no_grasps",
             )
         return sweeps

@@ -1,4 +1,4 @@
-"""Turned outlines, hollow ones too, as convex pieces: what a physics engine wants of them."""
+"""Solids of revolution, hollow ones too, as convex pieces for a physics engine."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 
-_ROUND = 20  # corners of a full circle
+_CIRCLE_CORNERS = 20
 _MIN_RADIUS_M = 1e-4
 
 
@@ -19,7 +19,7 @@ def split_turned_solid(outline: np.ndarray, rounding_m: float = 0.0) -> list[np.
 
     Args:
         outline: closed polygon of (radius, height) [m].
-        rounding_m: how far the solid reaches beyond the outline; only taken for one without a hollow [m].
+        rounding_m: distance of the surface beyond the outline; only used without a hollow [m].
     """
     pieces = []
     outline = np.round(outline, 6)
@@ -48,14 +48,14 @@ def _strips(outline: np.ndarray) -> Iterator[tuple[np.ndarray, list[tuple[np.nda
 
 
 def _frustum(radii: np.ndarray, z: np.ndarray) -> np.ndarray:
-    angle = 2.0 * np.pi * np.arange(_ROUND) / _ROUND
+    angle = 2.0 * np.pi * np.arange(_CIRCLE_CORNERS) / _CIRCLE_CORNERS
     return np.concatenate([_circle(r, angle, height) for r, height in zip(radii, z, strict=True)])
 
 
 def _wedges(inner: np.ndarray, outer: np.ndarray, z: np.ndarray) -> list[np.ndarray]:
     pieces = []
-    for k in range(_ROUND):
-        angle = 2.0 * np.pi * np.array([k, k + 1]) / _ROUND
+    for k in range(_CIRCLE_CORNERS):
+        angle = 2.0 * np.pi * np.array([k, k + 1]) / _CIRCLE_CORNERS
         rims = [_circle(radii[end], angle, z[end]) for radii in (inner, outer) for end in (0, 1)]
         pieces.append(np.concatenate(rims))
     return pieces

@@ -1,4 +1,4 @@
-"""The generator's own samples with verdicts: what its discriminator learns from (on-generator training)."""
+"""Labelled samples of the generator, the training data of its discriminator (on-generator training)."""
 
 from __future__ import annotations
 
@@ -14,43 +14,45 @@ from torch import Tensor
 from models.diffusion.network import N_COORDINATES, Denoiser, decode_grasps, encode_grasps
 from models.diffusion.training.data import GraspData
 from models.diffusion.training.dynamics_test import simulate_grasps
-from models.diffusion.training.labels import ParallelGripperSpec, AnyGripper, check_grasps
+from models.diffusion.training.grippers import AnyGripper, ParallelGripperSpec
+from models.diffusion.training.labels import check_grasps
 
 ProgressCallback = Callable[[int, float], None]
+"""Called with the number of items done and the current value (a loss, or a ratio)."""
 _BATCH = 16
 _CHUNK = 10 * _BATCH  # views in a file
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LabellingConfig:
-    """How many grasps are judged, and how."""
+    """Numbers of labelled grasps, and their labels."""
 
     views: int = 10000
     """Views whose samples are labelled."""
     samples: int = 64
-    """Of the generator's own, on each."""
+    """Samples of the generator on each."""
     perturbed: int = 32
-    """Ground truth knocked aside by up to 20 mm and some 20°, on each."""
+    """Ground-truth grasps perturbed by up to 20 mm and some 20°, on each."""
     steps: int = 5
-    """Denoising steps with which the samples are made."""
+    """Denoising steps of the samples."""
     simulated_fraction: float = 0.01
-    """Share of what the exact check lets pass that is also tried in dynamics; what is lost there counts as invalid."""
+    """Ratio of the valid grasps that are also simulated; those lost there count as invalid."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LabelledSamples:
-    """Grasps with their verdicts."""
+    """Grasps with their labels."""
 
     views: np.ndarray
     """(J,) indices of the views."""
     grasps: Tensor
     """(J, K, 10)."""
     valid: Tensor
-    """(J, K) 1.0 where the check passed, and the shaking for those that were shaken."""
+    """(J, K) 1.0 where the exact check passed, and the dynamics test of the simulated ones."""
     simulated: int
-    """Grasps that were tried in dynamics."""
+    """Number of grasps that were simulated."""
     lost: int
-    """Those of them that did not hold."""
+    """Number of those that did not hold."""
 
 
 def label_samples(
@@ -63,9 +65,9 @@ def label_samples(
     folder: Path,
     progress: ProgressCallback,
 ) -> LabelledSamples:
-    """Return the generator's own samples and perturbed ground truth with the verdicts of check and shaking.
+    """Return the generator's samples and perturbed ground truth, labelled by exact check and dynamics test.
 
-    Chunks are kept in `folder`; those of this very generator are not made again.
+    Chunks are kept in `folder`; those of the same generator and configuration are reused.
     """
     folder.mkdir(parents=True, exist_ok=True)
     digest = _digest(generator, config)
@@ -108,7 +110,7 @@ def _label_chunk(  # noqa: PLR0917
         with torch.autocast("cpu", torch.bfloat16):
             own = generator.sample(cloud, torch.randn(len(part), config.samples, N_COORDINATES), config.steps)
         T, widths = data.draw_grasps(part, config.perturbed, rng)
-        v = torch.cat([own.float(), _perturbed(encode_grasps(torch.from_numpy(T), torch.from_numpy(widths)))], dim=1)
+        v = torch.cat([own.float(), _perturb(encode_grasps(torch.from_numpy(T), torch.from_numpy(widths)))], dim=1)
         T_view, widths_view = (a.numpy() for a in decode_grasps(v.double()))
         for row, view in enumerate(part):
             T_object = np.linalg.inv(data.T_view_object[view].astype(np.float64)) @ T_view[row]
@@ -116,7 +118,7 @@ def _label_chunk(  # noqa: PLR0917
             check = check_grasps(solid, T_object, gripper, widths_view[row])
             simulated = check.valid & (rng.random(len(T_object)) < config.simulated_fraction)
             lost = np.zeros_like(simulated)
-            if isinstance(gripper, ParallelGripperSpec):  # a beak's jaws are not modelled in dynamics
+            if isinstance(gripper, ParallelGripperSpec):  # the dynamics test models parallel fingers only
                 lost[simulated] = ~simulate_grasps(solid, T_object[simulated], check[simulated], gripper)
                 rows["simulated"].append(simulated)
                 rows["lost"].append(lost)
@@ -139,15 +141,15 @@ def _load(path: Path, digest: str) -> dict[str, np.ndarray] | None:
 
 
 def _digest(generator: Denoiser, config: LabellingConfig) -> str:
-    """Return what tells one generator and way of judging from another."""
-    seen = hashlib.sha256(repr(config).encode())
+    """Return the hash of a generator and its labelling configuration."""
+    digest = hashlib.sha256(repr(config).encode())
     for value in generator.state_dict().values():
-        seen.update(value.numpy().tobytes())
-    return seen.hexdigest()
+        digest.update(value.numpy().tobytes())
+    return digest.hexdigest()
 
 
-def _perturbed(v: Tensor) -> Tensor:
-    """Return grasps (B, K, 10) each knocked aside by its own random amount."""
+def _perturb(v: Tensor) -> Tensor:
+    """Return grasps (B, K, 10) each perturbed by its own random amount."""
     amount = torch.rand(*v.shape[:2], 1)
     scale = torch.tensor([0.4] * 3 + [0.35] * 6 + [0.2])
     return v + amount * scale * torch.randn_like(v)

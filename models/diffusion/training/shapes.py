@@ -1,4 +1,4 @@
-"""Procedural objects: families to train on, and families kept back for evaluation."""
+"""Procedural objects: families for the training, and held-out families for the evaluation."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ def make_shape(family: str, rng: np.random.Generator) -> Solid:
     """Return a random object of `family`, its up along z and its middle near the origin [m].
 
     Raises:
-        ValueError: the family is unknown.
+        InvalidValueError: the family is unknown.
     """
     makers = {**KNOWN_FAMILIES, **HELD_OUT_FAMILIES}
     if family not in makers:
-        raise InvalidValueError(f"Unknown family {family!r}; known: {', '.join(makers)}.")
+        raise InvalidValueError(f"Unknown family {family!r}; known: {', '.join(makers)}.", code="unknown_family")
     return make_solid(family, makers[family](lambda low, high: float(rng.uniform(low, high)), rng))
 
 
@@ -100,7 +100,7 @@ def _l_shape(u: Draw, rng: np.random.Generator) -> list[PartArrays]:
 
 
 def _lathe(u: Draw, rng: np.random.Generator) -> list[PartArrays]:
-    """A random smooth outline: vases, skittles, jars, spools."""
+    """Return a solid of revolution with a random smooth outline, like vases, skittles, jars, spools."""
     height, widest = u(0.04, 0.22), u(0.015, 0.05)
     knots = rng.uniform(0.25, 1.0, int(rng.integers(3, 7)))
     at = np.linspace(0.0, 1.0, 14)
@@ -109,7 +109,7 @@ def _lathe(u: Draw, rng: np.random.Generator) -> list[PartArrays]:
 
 
 def _union(u: Draw, rng: np.random.Generator) -> list[PartArrays]:
-    """Two or three boxes, capsules and cylinders that meet, some square to each other, some anyhow."""
+    """Return two or three touching boxes, capsules and cylinders, at right angles or random orientations."""
     parts = []
     for lift in rng.permutation([-0.025, 0.03, 0.0])[: rng.integers(2, 4)]:
         kind, slim = rng.integers(3), u(0.0, 1.0) < 0.4
@@ -171,7 +171,7 @@ KNOWN_FAMILIES = {
     "lathe": _lathe,
     "union": _union,
 }
-"""What training sees."""
+"""Families in the training data."""
 FAMILY_WEIGHTS = {
     "box": 0.17,
     "cylinder": 0.09,
@@ -184,6 +184,6 @@ FAMILY_WEIGHTS = {
     "lathe": 0.12,
     "union": 0.17,
 }
-"""Share of each known family in a data set."""
+"""Ratio of each known family in a data set."""
 HELD_OUT_FAMILIES = {"mug": _mug, "dumbbell": _dumbbell, "goblet": _goblet, "hammer": _hammer}
-"""What only the evaluation sees."""
+"""Families in the evaluation only."""

@@ -1,4 +1,4 @@
-"""Trains the generator, and the discriminator on what was said of the generator's samples."""
+"""Training of the generator, and of the discriminator on labelled samples of the generator."""
 
 from __future__ import annotations
 
@@ -16,16 +16,14 @@ from torch.nn import functional as F
 
 from models.diffusion.network import Denoiser, Discriminator, encode_grasps
 from models.diffusion.training.data import GraspData, augment
-from models.diffusion.training.labelled_samples import LabelledSamples, LabellingConfig
+from models.diffusion.training.labelled_samples import LabelledSamples, LabellingConfig, ProgressCallback
 
 ModuleT = TypeVar("ModuleT", bound=nn.Module)
-ProgressCallback = Callable[[int, float], None]
-"""Called with the iteration and the loss."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrainingConfig:
-    """How long and how fast; the recipe that is written beside the weights."""
+    """Iterations, rates and batches, as written into the weights' recipe."""
 
     generator_iterations: int = 15000
     generator_rate: float = 1.5e-3
@@ -46,15 +44,15 @@ def train_generator(
     symmetric: bool = True,
     start_from: Denoiser | None = None,
 ) -> Denoiser:
-    """Return the generator, its weights averaged over the last iterations; goes on from `checkpoint` if it is there.
+    """Return the generator, its weights averaged over the last iterations; resumes from `checkpoint` if it exists.
 
     Args:
-        data: what to learn.
-        config: how long and how fast.
-        checkpoint: file to go on from and to write.
-        progress: told of each iteration.
-        symmetric: whether the hand is its own mirror image.
-        start_from: another hand's generator, to be tuned for this one.
+        data: views and ground-truth grasps.
+        config: iterations, rates and batches.
+        checkpoint: file to resume from and to write.
+        progress: called at each iteration.
+        symmetric: whether the gripper is its own mirror image.
+        start_from: generator of another gripper, to be tuned for this one.
     """
     model = _seeded(Denoiser, config.seed)
     if start_from is not None:
@@ -122,12 +120,12 @@ def train_discriminator(
 def calibrate_discriminator(
     discriminator: Discriminator, data: GraspData, labelled: LabelledSamples
 ) -> tuple[float, float]:
-    """Set scale and offset of the discriminator's logits so that its scores are the shares that hold; return both.
+    """Set scale and offset of the discriminator's logits so that scores are success ratios; return both.
 
     Args:
         discriminator: changed in its last layer.
-        data: shapes that it was not trained on.
-        judged: what was said of samples on those.
+        data: shapes outside of the training data.
+        labelled: samples on those.
     """
     with torch.inference_mode():
         logits = torch.cat(
@@ -176,7 +174,7 @@ def _descend(
         optimiser.load_state_dict(saved["optimiser"])
         start = int(saved["iteration"])
     for iteration in range(start, iterations):
-        # Seeds of each iteration's own: a resumed run draws what an unbroken one would.
+        # Seeds for each iteration: a resumed run draws the same numbers as an uninterrupted one.
         rng = np.random.default_rng((seed, iteration))
         torch.manual_seed(seed * 1_000_003 + iteration)
         for group in optimiser.param_groups:

@@ -121,7 +121,10 @@ def test_noise_is_normal_and_of_the_seed(n):
 
 
 def test_noise_fills_its_space_more_evenly_than_independent_draws():
-    even, independent = draw_even_normal(800, 10, np.random.default_rng(0)), np.random.default_rng(0).normal(size=(800, 10))
+    even, independent = (
+        draw_even_normal(800, 10, np.random.default_rng(0)),
+        np.random.default_rng(0).normal(size=(800, 10)),
+    )
     assert discrepancy(ndtr(even)) < 0.5 * discrepancy(ndtr(independent))
     assert even.std(axis=0) == pytest.approx(np.ones(10), abs=0.05)
 

@@ -119,7 +119,9 @@ def test_every_family_can_be_made_and_grasped_and_none_is_in_both_sets():
 
 
 def test_a_view_shows_the_near_side_within_the_camera_noise():
-    view = ViewConfig(distance_m=(0.3, 0.3), noise_per_m=(0.005, 0.005), flying_point_ratio=0.0, occluded_view_ratio=0.0)
+    view = ViewConfig(
+        distance_m=(0.3, 0.3), noise_per_m=(0.005, 0.005), flying_point_ratio=0.0, occluded_view_ratio=0.0
+    )
     points, T_camera_object = look(view, 3)
     T_object_camera = np.linalg.inv(T_camera_object)
     local = points @ T_object_camera[:3, :3].T + T_object_camera[:3, 3]
