@@ -18,7 +18,7 @@ import yaml
 from models.nvidia.errors import GeneratorError
 from models.nvidia.nvidia import NvidiaSampler, load_in_process
 from models.nvidia.process import ProcessGenerator
-from models.nvidia.torch_patches import cuda_if_available, seed_random_numbers, fold_attention
+from models.nvidia.torch_patches import cuda_if_available, fold_attention, seed_random_numbers
 from models.types import GraspGenerator
 
 CLOUD = np.random.default_rng(0).uniform([-0.03, -0.05, 0.38], [0.03, 0.05, 0.42], (700, 3))

@@ -12,7 +12,7 @@ from models.nvidia import pointnet_ops
 from models.nvidia.errors import GeneratorError
 from models.nvidia.graspgenx import Z1_GRIPPER, sweep_numbers
 from models.nvidia.nvidia import NvidiaSampler, make_nvidia_generator
-from models.nvidia.torch_patches import replace_compiled_ops, cuda_if_available, seed_random_numbers, fold_attention
+from models.nvidia.torch_patches import cuda_if_available, fold_attention, replace_compiled_ops, seed_random_numbers
 from z1_runtime.geometry import gripper_geometry
 
 CLOUD = np.random.default_rng(0).uniform([-0.03, -0.05, 0.38], [0.03, 0.05, 0.42], (500, 3))

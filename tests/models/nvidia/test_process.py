@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from models.nvidia.errors import GeneratorError
-from models.nvidia.process import WORKER, ProcessGenerator
 from models.nvidia.pipe import PipeError, read_message, write_message
+from models.nvidia.process import WORKER, ProcessGenerator
 
 PYTHON = Path(sys.executable)
 CLOUD = np.random.default_rng(0).uniform([-0.03, -0.05, 0.38], [0.03, 0.05, 0.42], (200, 3))

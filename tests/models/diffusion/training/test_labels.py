@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from models.diffusion.training.labels import GRIPPERS, ParallelGripperSpec, check_grasps, find_grasps
-from models.diffusion.training.shapes import FAMILY_WEIGHTS, KNOWN_FAMILIES, HELD_OUT_FAMILIES, make_shape
+from models.diffusion.training.shapes import FAMILY_WEIGHTS, HELD_OUT_FAMILIES, KNOWN_FAMILIES, make_shape
 from models.diffusion.training.solids import BOX, CAPSULE, LATHE, TORUS, make_part, make_solid
 from models.diffusion.training.views import ViewConfig, render_view
 
