@@ -1,4 +1,4 @@
-"""How the detector learns: what the loss is, and that a phase goes on where it stopped."""
+"""Training of the detector: its loss, and the resumption of a phase."""
 
 from pathlib import Path
 
@@ -19,7 +19,7 @@ from models.detector.training import (
 )
 
 
-def test_the_loss_in_bfloat16_is_the_loss_but_for_rounding() -> None:
+def test_the_loss_in_bfloat16_differs_by_rounding_only() -> None:
     from ultralytics.cfg import get_cfg
     from ultralytics.nn.tasks import SegmentationModel
 
@@ -39,7 +39,7 @@ def test_the_loss_in_bfloat16_is_the_loss_but_for_rounding() -> None:
     assert ours.sum().item() == pytest.approx(plain.sum().item(), rel=0.05)
 
 
-def test_a_phase_that_is_done_is_not_done_again_and_gives_finite_weights(tmp_path: Path) -> None:
+def test_a_complete_phase_is_not_repeated_and_gives_finite_weights(tmp_path: Path) -> None:
     for split in ("train", "val"):
         (tmp_path / "images" / split).mkdir(parents=True)
         (tmp_path / "labels" / split).mkdir(parents=True)
