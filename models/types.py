@@ -14,7 +14,7 @@ from hal.base.errors import InvalidValueError
 class GraspSet:
     """Candidate grasps of a parallel jaw, in the paper's grasp frame.
 
-    z is the approach, y runs along the finger opening, the origin lies midway between the fingertips.
+    z is the approach, y runs along the finger opening, the origin is midway between the fingertips.
     """
 
     T_camera_grasps: np.ndarray

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from hal.base.transforms import inverse
 from models.diffusion.cloud import prepare_cloud
 from models.diffusion.sampler import DiffusionConfig
 from models.torch_threads import single_threaded_workers
@@ -48,7 +49,7 @@ class GraspScorer:
 
         points = check_object_cloud(points, len(grasps))
         cloud = prepare_cloud(points, np.random.default_rng(seed))
-        T_view_grasps = np.linalg.inv(cloud.T_camera_view) @ grasps.T_camera_grasps
+        T_view_grasps = inverse(cloud.T_camera_view) @ grasps.T_camera_grasps
         widths = np.array(grasps.widths_m)
         missing = ~np.isfinite(widths)
         widths[missing] = measure_widths(cloud.points, T_view_grasps[missing])

@@ -83,17 +83,17 @@ def main(config: Config) -> int:
 def _run(config: Config, seed: int, console: Console) -> dict[str, float]:
     """Return the errors of one calibration."""
     with tempfile.TemporaryDirectory() as folder:
-        seen = _capture(config, seed, Path(folder) / "samples")
+        observed = _capture(config, seed, Path(folder) / "samples")
         if config.joint_noise_rad:
-            _blur_joints(seen, config.joint_noise_rad, seed)
-        result = solve(seen, seen.session.camera)
+            _blur_joints(observed, config.joint_noise_rad, seed)
+        result = solve(observed, observed.session.camera)
     if seed == 0 and config.corrupted:
-        _corrupt(seen, config.corrupted, console)
-    assert seen.session.truth is not None
-    error_m, error_rad = pose_error(np.array(seen.session.truth["T_mount_camera"]), result.T_mount_camera)
+        _corrupt(observed, config.corrupted, console)
+    assert observed.session.truth is not None
+    error_m, error_rad = pose_error(np.array(observed.session.truth["T_mount_camera"]), result.T_mount_camera)
     row = {
         "seed": seed,
-        "samples": len(seen.names),
+        "samples": len(observed.names),
         "error_mm": 1e3 * error_m,
         "error_deg": float(np.rad2deg(error_rad)),
         "uncertainty_mm": result.uncertainty_mm,
@@ -157,28 +157,28 @@ def _capture_by_jumps(scene: SceneConfig, poses: int, folder: Path) -> None:
     rig.camera.disconnect()
 
 
-def _blur_joints(seen: SeenSamples, sd_rad: float, seed: int) -> None:
+def _blur_joints(observed: SeenSamples, sd_rad: float, seed: int) -> None:
     """Recompute the arm pose of each sample from joints with a measurement error."""
     from z1_runtime.geometry.kinematics import Kinematics
 
     kinematics, rng = Kinematics(), np.random.default_rng([seed, 1])
-    for number, sample in enumerate(seen.samples):
+    for number, sample in enumerate(observed.samples):
         q = sample.q[:6] + rng.normal(0.0, sd_rad, 6)
-        seen.samples[number] = replace(sample, T_base_flange=kinematics.flange(q))
+        observed.samples[number] = replace(sample, T_base_flange=kinematics.flange(q))
 
 
-def _corrupt(seen: SeenSamples, n: int, console: Console) -> None:
+def _corrupt(observed: SeenSamples, n: int, console: Console) -> None:
     """Print whether `n` samples whose arm pose is falsified by 10 mm are dropped."""
-    samples = list(seen.samples)
+    samples = list(observed.samples)
     wrong = np.random.default_rng(0).choice(len(samples), n, replace=False)
     for number in wrong:
         T = samples[number].T_base_flange.copy()
         T[:3, 3] += [0.006, -0.008, 0.0]
         samples[number] = replace(samples[number], T_base_flange=T)
-    result = solve(replace(seen, samples=samples), seen.session.camera)
-    assert seen.session.truth is not None
-    error_m, error_rad = pose_error(np.array(seen.session.truth["T_mount_camera"]), result.T_mount_camera)
-    falsified = {seen.names[number] for number in wrong}
+    result = solve(replace(observed, samples=samples), observed.session.camera)
+    assert observed.session.truth is not None
+    error_m, error_rad = pose_error(np.array(observed.session.truth["T_mount_camera"]), result.T_mount_camera)
+    falsified = {observed.names[number] for number in wrong}
     verdict = "all dropped, no other" if falsified == set(result.dropped) else "[red]not the same[/]"
     dropped = ", ".join(sorted(result.dropped)) or "none"
     console.print(
@@ -231,9 +231,9 @@ def _mounts(config: Config, folder: Path) -> dict[str, Path]:
     """Return a result file for the drawing's extrinsics, the ones calibrated with seed 0, and the true ones."""
     from calibration.results import Calibration, save_result
 
-    seen = _capture(config, 0, folder / "samples")
-    result = solve(seen, seen.session.camera)
-    session, ground_truth = seen.session, seen.session.truth
+    observed = _capture(config, 0, folder / "samples")
+    result = solve(observed, observed.session.camera)
+    session, ground_truth = observed.session, observed.session.truth
     assert ground_truth is not None
 
     def save(T_mount_camera: np.ndarray, base: HandEyeResult) -> Path:

@@ -65,9 +65,7 @@ def main(config: Config) -> None:
             camera.wait_for_frame(1.0)
         cpu_s, passed_s = time.process_time() - cpu_s, clock.now_s() - start_s
         camera.disconnect()
-    print(
-        f"lock-step  {count / passed_s:5.1f} frames/s, {1e3 * cpu_s / count:.1f} ms of processor/frame, with physics"
-    )
+    print(f"lock-step  {count / passed_s:5.1f} frames/s, {1e3 * cpu_s / count:.1f} ms of processor/frame, with physics")
 
 
 if __name__ == "__main__":

@@ -3,7 +3,7 @@
     python -m scripts.train.make_grasp_dataset                  # 64 shards of 100 shapes × 4 views
     python -m scripts.train.make_grasp_dataset --shards 2       # a small one
     python -m scripts.train.make_grasp_dataset --gripper z1     # for the Z1's own gripper
-    python -m scripts.train.make_grasp_dataset --seed 2000 --view.occluded-share 1    # more, all occluded in part
+    python -m scripts.train.make_grasp_dataset --seed 2000 --view.occluded-view-ratio 1    # more, all occluded in part
 
 Existing shards are kept, so an interrupted run resumes. Each is made from its own seed. Every label passes the exact
 check; one of each shape is also simulated in MuJoCo, with the outcome in `<shard>.simulated.json`.

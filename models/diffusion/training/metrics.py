@@ -7,6 +7,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
+from hal.base.transforms import inverse
 from models.diffusion.training.dynamics_test import simulate_grasps
 from models.diffusion.training.grippers import AnyGripper, ParallelGripperSpec
 from models.diffusion.training.labels import GraspCheck, check_grasps, find_grasps
@@ -69,7 +70,7 @@ def measure_cloud(
     simulations: int = 0,
 ) -> CloudMetrics:
     """Return the metrics of `generator`'s grasps for one view; `simulations` of each label are simulated."""
-    T_object_camera = np.linalg.inv(T_camera_object)
+    T_object_camera = inverse(T_camera_object)
     ground_truth = find_grasps(solid, gripper, np.random.default_rng(1))[0][:_MAX_GROUND_TRUTH]
     grasps = _sample(generator, points, samples)
     raw = generator.draw(points, samples, 0) if isinstance(generator, _Oversampling) else grasps

@@ -15,7 +15,7 @@ from models.diffusion.training.shapes import FAMILY_WEIGHTS, make_shape
 from models.diffusion.training.solids import Solid
 from models.diffusion.training.views import ViewConfig, render_view
 
-_MIN_GRASPS = 40  # shapes with fewer labels are dropped: most are too wide for the gripper
+_MIN_GRASPS = 40  # shapes with fewer labels are dropped
 _MAX_GRASPS = 384
 _MAX_PARTS = 3  # of any family in `shapes`
 

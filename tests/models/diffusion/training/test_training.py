@@ -56,7 +56,7 @@ def test_a_grasp_lost_in_simulation_counts_as_invalid(data, tmp_path, monkeypatc
     generator = Denoiser().eval()
     without_simulation = label(generator, data, tmp_path / "none", simulated_fraction=0.0)
     monkeypatch.setattr(
-        "models.diffusion.training.labelled_samples.shake_grasps", lambda _, T, *__: np.arange(len(T)) % 2 == 0
+        "models.diffusion.training.labelled_samples.simulate_grasps", lambda _, T, *__: np.arange(len(T)) % 2 == 0
     )
     labelled = label(generator, data, tmp_path / "all", simulated_fraction=1.0)
     assert labelled.simulated == without_simulation.valid.sum() > 0
