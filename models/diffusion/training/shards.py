@@ -66,6 +66,7 @@ def draw_views(
         points, T_camera_object = view
         cloud = prepare_cloud(points, rng)
         rows = np.concatenate([cloud.points, cloud.normals], axis=1).astype(np.float16)
+        # The general inverse, as in all shards so far: its last bits differ from those of the rigid one.
         views.append((rows, (np.linalg.inv(cloud.T_camera_view) @ T_camera_object).astype(np.float32)))
     return views
 

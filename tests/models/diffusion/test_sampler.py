@@ -11,6 +11,7 @@ from scipy.special import ndtr
 from scipy.stats.qmc import discrepancy
 
 from hal.base.errors import InvalidValueError
+from hal.base.transforms import inverse
 from models.diffusion.sampler import DiffusionConfig, DiffusionSampler, draw_even_normal
 from models.diffusion.selection import choose_grasps
 from models.diffusion.training.grippers import GRIPPERS
@@ -69,7 +70,7 @@ def test_most_grasps_of_new_bottles_are_valid_and_the_best_scored_more_than_the_
     for seed in range(50, 60):
         solid, points, T_camera_object = make_bottle_view(seed)
         grasps = sampler.sample(points, 200, 0)
-        check = check_grasps(solid, np.linalg.inv(T_camera_object) @ grasps.T_camera_grasps, GRIPPERS["agnostic"])
+        check = check_grasps(solid, inverse(T_camera_object) @ grasps.T_camera_grasps, GRIPPERS["agnostic"])
         raw.append(check.valid.mean())
         best.append(check.valid[:50].mean())
         worst.append(check.valid[-50:].mean())
@@ -83,7 +84,7 @@ def test_oversampling_gives_better_grasps_of_as_many_kinds(sampler):
     drawn_valid, chosen_valid, drawn_kinds, chosen_kinds = [], [], [], []
     for seed in range(70, 78):
         solid, points, T_camera_object = make_bottle_view(seed)
-        T_object_camera = np.linalg.inv(T_camera_object)
+        T_object_camera = inverse(T_camera_object)
         for grasps, valid, kinds in (
             (sampler.draw(points, 200, 0), drawn_valid, drawn_kinds),
             (sampler.sample(points, 200, 0), chosen_valid, chosen_kinds),

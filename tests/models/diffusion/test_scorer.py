@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from hal.base.errors import InvalidValueError
+from hal.base.transforms import inverse
 from models.diffusion.sampler import DiffusionConfig, DiffusionSampler
 from models.diffusion.scorer import GraspScorer, measure_widths
 from models.diffusion.training.grippers import GRIPPERS
@@ -48,11 +49,11 @@ def test_scores_of_the_samplers_grasps_correlate_with_its_own(scorer, box_view):
 def test_valid_grasps_score_above_the_same_turned_by_90_degrees(scorer, box_view):
     solid, points, T_camera_object = box_view
     grasps = DiffusionSampler().sample(points, 200, 1)
-    check = check_grasps(solid, np.linalg.inv(T_camera_object) @ grasps.T_camera_grasps, GRIPPERS["agnostic"])
+    check = check_grasps(solid, inverse(T_camera_object) @ grasps.T_camera_grasps, GRIPPERS["agnostic"])
     good = grasps.T_camera_grasps[check.valid][:50]
     turned = good.copy()
     turned[:, :3, :2] = good[:, :3, 1::-1] * [1.0, -1.0]  # about the approach: the jaws close on edges or on air
-    fails = ~check_grasps(solid, np.linalg.inv(T_camera_object) @ turned, GRIPPERS["agnostic"]).valid
+    fails = ~check_grasps(solid, inverse(T_camera_object) @ turned, GRIPPERS["agnostic"]).valid
     held, missed = scorer.score(points, as_set(good)), scorer.score(points, as_set(turned[fails]))
     assert fails.sum() > 20 and held.mean() > missed.mean() + 0.2
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from hal.base.errors import InvalidValueError, Z1Error
+from hal.base.transforms import inverse
 from models.diffusion.training.grippers import GRIPPERS
 from models.diffusion.training.labels import check_grasps
 from models.diffusion.training.shapes import make_shape
@@ -94,7 +95,7 @@ def test_most_grasps_of_boxes_and_cylinders_are_valid():
         assert view is not None
         points, T_camera_object = view
         grasps = ObbSweepSampler().sample(points, 150, 0)
-        check = check_grasps(solid, np.linalg.inv(T_camera_object) @ grasps.T_camera_grasps, GRIPPERS["agnostic"])
+        check = check_grasps(solid, inverse(T_camera_object) @ grasps.T_camera_grasps, GRIPPERS["agnostic"])
         valid.append(check.valid.mean())
     assert np.mean(valid) > 0.75
 

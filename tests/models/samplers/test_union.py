@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from hal.base.errors import InvalidValueError
+from hal.base.transforms import inverse
 from models.diffusion.sampler import DiffusionSampler
 from models.diffusion.training.grippers import GRIPPERS
 from models.diffusion.training.labels import check_grasps
@@ -114,7 +115,7 @@ def test_sweep_and_diffusion_together_hold_no_worse_than_the_sweep_alone():
         points, T_camera_object = view
         for generator, valid in ((union, joined), (union.members[0], alone)):
             grasps = generator.sample(points, 150, 0)
-            T = np.linalg.inv(T_camera_object) @ grasps.T_camera_grasps
+            T = inverse(T_camera_object) @ grasps.T_camera_grasps
             valid.append(check_grasps(solid, T, GRIPPERS["agnostic"]).valid.mean())
         again = union.sample(points, 150, 0)
         np.testing.assert_array_equal(again.T_camera_grasps, union.sample(points, 150, 0).T_camera_grasps)
