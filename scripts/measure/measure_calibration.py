@@ -1,7 +1,7 @@
 """Measure the errors of the twin's hand-eye calibrations over many seeds, and their effect on grasps.
 
-    .venv/bin/python -m scripts.measure.measure_calibration             # 20 calibrations of 20 poses each
-    .venv/bin/python -m scripts.measure.measure_calibration --demos 9   # and 9 demos with each of three extrinsics
+.venv/bin/python -m scripts.measure.measure_calibration             # 20 calibrations of 20 poses each
+.venv/bin/python -m scripts.measure.measure_calibration --demos 9   # and 9 demos with each of three extrinsics
 """
 
 from __future__ import annotations
