@@ -1,4 +1,4 @@
-"""How torch uses this processor: threads within which it starts none of its own, and bfloat16."""
+"""Use of the processor by torch: worker threads without torch's own thread pool, and bfloat16."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from concurrent.futures import ThreadPoolExecutor
 
 
 def single_threaded_workers(count: int, name: str) -> ThreadPoolExecutor:
-    """Return workers called `name` within which torch uses one thread each.
+    """Return a pool of `count` workers called `name`, in each of which torch uses one thread.
 
-    Torch's own threads wait for each other after every operation, some thousand times a call: beside a servo loop on
-    two cores that took 12 s where 0.2 s were due. These wait once, at the end.
+    Torch's own threads synchronise after every operation, some thousand times a call: next to a servo loop on two
+    cores that took 12 s instead of 0.2 s. These workers synchronise once, at the end.
     """
     import torch
 
@@ -22,13 +22,13 @@ def single_threaded_workers(count: int, name: str) -> ThreadPoolExecutor:
 
     barrier = threading.Barrier(count)
     workers = ThreadPoolExecutor(count, thread_name_prefix=name, initializer=begin)
-    list(workers.map(lambda _: barrier.wait(), range(count)))  # all have begun
+    list(workers.map(lambda _: barrier.wait(), range(count)))  # every thread has run `begin`
     torch.set_num_threads(before)
     return workers
 
 
 def has_bfloat16() -> bool:
-    """Return whether the processor computes in bfloat16; where it only imitates that, float32 is faster."""
+    """Return whether the processor has bfloat16 instructions; emulated bfloat16 is slower than float32."""
     import torch
 
     return bool(torch.cpu.get_capabilities().get("avx512_bf16", False))

@@ -1,4 +1,4 @@
-"""What the models give each other, all in the camera's optical frame (x right, y down, z forward)."""
+"""Data between the models, all in the camera's optical frame (x right, y down, z forward)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from hal.base.errors import InvalidValueError
 class GraspSet:
     """Candidate grasps of a parallel jaw, in the paper's grasp frame.
 
-    z is the approach, y runs along the finger opening, the origin lies midway between the fingertips.
+    z is the approach, y runs along the finger opening, the origin is midway between the fingertips.
     """
 
     T_camera_grasps: np.ndarray
@@ -22,16 +22,17 @@ class GraspSet:
     scores: np.ndarray
     """(N,) confidence in [0, 1]."""
     widths_m: np.ndarray
-    """(N,) distance between the two contacts along y [m]; NaN where the generator does not say."""
+    """(N,) distance between the two contacts along y [m]; NaN where the generator gives none."""
     source: str = ""
-    """Which generator made them."""
+    """Name of the generator that proposed them."""
 
     def __post_init__(self) -> None:
         n = len(self.T_camera_grasps)
         if self.T_camera_grasps.shape != (n, 4, 4) or self.scores.shape != (n,) or self.widths_m.shape != (n,):
             raise InvalidValueError(
                 f"GraspSet wants (N, 4, 4), (N,), (N,); got {self.T_camera_grasps.shape}, "
-                f"{self.scores.shape}, {self.widths_m.shape}."
+                f"{self.scores.shape}, {self.widths_m.shape}.",
+                code="shape",
             )
         for array in (self.T_camera_grasps, self.scores, self.widths_m):
             array.setflags(write=False)
@@ -40,7 +41,7 @@ class GraspSet:
         return len(self.scores)
 
     def __getitem__(self, index: np.ndarray | slice) -> GraspSet:
-        """Return the grasps that `index` (a slice, a mask or an array of indices) picks, in its order."""
+        """Return the grasps at `index` (a slice, a mask or an array of indices), in its order."""
         return GraspSet(
             T_camera_grasps=self.T_camera_grasps[index],
             scores=self.scores[index],
@@ -60,58 +61,63 @@ class Detection:
     box_px: tuple[int, int, int, int]
     """(u_min, v_min, u_max, v_max), the upper ends exclusive [px]."""
     mask: np.ndarray | None = field(default=None)
-    """(H, W) bool, the object's pixels, where the detector knows them."""
+    """(H, W) bool, the object's pixels, where the detector gives masks."""
 
 
 class GraspGenerator(Protocol):
-    """Proposes grasps for an object's points; knows neither arm, table nor gravity."""
+    """Source of grasp candidates for an object's points; independent of arm, table and gravity."""
 
     def sample(self, points: np.ndarray, n: int, seed: int) -> GraspSet:
         """Return `n` grasps in the frame of `points` (M, 3) [m]; the same seed gives the same grasps.
 
         Raises:
-            ValueError: too few points, or points that are not finite.
+            InvalidValueError: too few points, or points that are not finite.
         """
         ...
 
 
 MIN_CLOUD_POINTS = 30
-"""Fewest points a grasp generator takes."""
+"""Minimum number of points for a grasp generator: the neighbourhood of one normal (`models.samplers.surfels`)."""
 
 
 def check_request(points: np.ndarray, n: int) -> np.ndarray:
-    """Return `points` as float64 (M, 3), if a generator can be asked for `n` grasps on them.
+    """Return `points` as float64 (M, 3), valid for a request of `n` grasps.
 
     Raises:
-        ValueError: `n` is below one, too few points, another shape, or points that are not finite.
+        InvalidValueError: `n` is below one, too few points, another shape, or points that are not finite.
     """
     points = np.asarray(points, dtype=np.float64)
     if n < 1:
-        raise InvalidValueError(f"Asked for {n} grasps; ask for one or more.")
+        raise InvalidValueError(f"Asked for {n} grasps; ask for one or more.", code="grasp_count")
     if points.ndim != 2 or points.shape[1] != 3 or len(points) < MIN_CLOUD_POINTS:
-        raise InvalidValueError(f"Grasps need a cloud (M, 3) of {MIN_CLOUD_POINTS} points or more; got {points.shape}.")
+        raise InvalidValueError(
+            f"Grasps need a cloud (M, 3) of {MIN_CLOUD_POINTS} points or more; got {points.shape}.", code="cloud_points"
+        )
     if not np.isfinite(points).all():
-        raise InvalidValueError("The cloud holds points that are NaN or infinite; drop invalid depth first.")
+        raise InvalidValueError(
+            "The cloud holds points that are NaN or infinite; drop invalid depth first.", code="cloud_not_finite"
+        )
     return points
 
 
-LARGEST_OBJECT_M = 1.0
-"""Longest side of a cloud that can be one object's, in metres; one in millimetres is far above."""
-SMALLEST_OBJECT_M = 0.002
-"""Points nearer together than this show no shape."""
+MAX_OBJECT_M = 1.0
+"""Longest side of one object's cloud [m]; a cloud in millimetres is far above."""
+MIN_OBJECT_M = 0.002
+"""Points nearer together than this show no shape [m]."""
 
 
 def check_object_cloud(points: np.ndarray, n: int) -> np.ndarray:
-    """Return `points` as float64 (M, 3), if they can be one object's, in metres, and `n` grasps be asked for.
+    """Return `points` as float64 (M, 3), valid as one object's cloud in metres for a request of `n` grasps.
 
     Raises:
-        ValueError: as `check_request`; also points all in one place, or not in metres.
+        InvalidValueError: as `check_request`; also points all in one place, or not in metres.
     """
     points = check_request(points, n)
     extent = float(np.ptp(points, axis=0).max())
-    if not SMALLEST_OBJECT_M < extent < LARGEST_OBJECT_M:
+    if not MIN_OBJECT_M < extent < MAX_OBJECT_M:
         raise InvalidValueError(
-            f"The cloud spans {extent:.4g} m; allowed is {SMALLEST_OBJECT_M} to {LARGEST_OBJECT_M} m. "
-            "Give one object's points, in metres (not millimetres)."
+            f"The cloud spans {extent:.4g} m; allowed is {MIN_OBJECT_M} to {MAX_OBJECT_M} m. "
+            "Give one object's points, in metres (not millimetres).",
+            code="cloud_extent",
         )
     return points

@@ -1,4 +1,4 @@
-"""Arrays of a network on disk: one `.npz` without pickles, and its SHA-256 beside it."""
+"""Arrays of a network on disk: one `.npz` without pickles, and a file with its SHA-256."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ WEIGHTS_FOLDER = Path(__file__).resolve().parent / "weights"
 
 
 class WeightsError(Z1Error, ValueError):
-    """A weights file that is missing, damaged or of another network."""
+    """Weights file that is missing, damaged or of another network."""
 
     default_code = "weights"
 
 
 def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> str:
-    """Write `arrays` to `path` and their SHA-256 beside it; return the latter.
+    """Write `arrays` to `path` and their SHA-256 next to it; return the latter.
 
-    What lies there already stays whole until the new file is.
+    An existing file stays whole until the new one is complete.
 
     Raises:
-        ValueError: `path` does not end in .npz.
+        InvalidValueError: `path` does not end in .npz.
     """
     if path.suffix != ".npz":
-        raise InvalidValueError(f"{path} must end in .npz: weights are kept as NumPy arrays.")
+        raise InvalidValueError(f"{path} must end in .npz: weights are kept as NumPy arrays.", code="weights_suffix")
     partial = path.with_name(f".{path.stem}.{os.getpid()}.npz")
     try:
         np.savez(partial, allow_pickle=False, **arrays)
@@ -42,37 +42,43 @@ def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> str:
     return digest
 
 
-def read_arrays(path: Path, maker: str) -> dict[str, np.ndarray]:
-    """Return the arrays of the file at `path`; `maker` is the command that makes such a file.
+def read_arrays(path: Path, make_command: str) -> dict[str, np.ndarray]:
+    """Return the arrays of the file at `path`; `make_command` is named in errors as the way to make it.
 
     Raises:
-        WeightsError: the file or its checksum is missing, they do not agree, or the file holds no plain arrays.
+        WeightsError: the file or its checksum is missing, they differ, or the file holds no plain arrays.
     """
-    checked_sha256(path, maker)
+    verify_sha256(path, make_command)
     try:
         with np.load(path, allow_pickle=False) as file:
             return {key: file[key] for key in file.files}
     except (ValueError, OSError, AttributeError, zipfile.BadZipFile) as err:
-        raise WeightsError(f"{path.name} holds no plain NumPy arrays ({err}); make it anew with `{maker}`.") from err
+        raise WeightsError(
+            f"{path.name} holds no plain NumPy arrays ({err}); make it again with `{make_command}`.",
+            code="weights_not_arrays",
+        ) from err
 
 
-def checked_sha256(path: Path, maker: str) -> str:
-    """Return the SHA-256 of the file at `path`, if it is the one beside it; `maker` is the command that makes both.
+def verify_sha256(path: Path, make_command: str) -> str:
+    """Return the SHA-256 of the file at `path` after comparing it with its checksum file.
 
     Raises:
-        WeightsError: the file or its checksum is missing, or they do not agree.
+        WeightsError: the file or its checksum is missing, or they differ.
     """
     checksum = path.with_suffix(".sha256")
     for needed in (path, checksum):
         if not needed.is_file():
-            raise WeightsError(f"{needed} is missing; restore it, or make it with `{maker}`.")
-    seen, wanted = sha256_of(path), next(iter(checksum.read_text().split()), "nothing")
-    if seen != wanted:
+            raise WeightsError(
+                f"{needed} is missing; restore it, or make it with `{make_command}`.", code="weights_missing"
+            )
+    actual, expected = sha256_of(path), next(iter(checksum.read_text().split()), "nothing")
+    if actual != expected:
         raise WeightsError(
-            f"{path.name} has SHA-256 {seen[:12]}…, {checksum.name} says {wanted[:12]}…: the file is damaged or was "
-            "exchanged; restore both from the repository."
+            f"{path.name} has SHA-256 {actual[:12]}…, {checksum.name} says {expected[:12]}…: the file is damaged or "
+            "was exchanged; restore both from the repository.",
+            code="weights_damaged",
         )
-    return seen
+    return actual
 
 
 def sha256_of(path: Path) -> str:

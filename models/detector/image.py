@@ -1,7 +1,7 @@
-"""What a YOLOv8 wants to be shown, and what its numbers say: the same arithmetic for every runtime.
+"""Input and output conversion of a YOLOv8: the same arithmetic for every runtime.
 
 Follows ultralytics' predict(): letterbox with grey 114, RGB, 1/255; non-maximum suppression within each class; masks
-are sums of prototypes, scaled up, cut at zero and at the box.
+are weighted sums of prototypes, scaled up, thresholded at zero and cropped to the box.
 """
 
 from __future__ import annotations
@@ -13,16 +13,16 @@ import numpy as np
 
 from models.types import Detection
 
-_GREY = 114
+_GREY = 114  # ultralytics' border colour, with which the networks were trained
 _STRIDES = (8, 16, 32)
-"""Pixels from anchor to anchor, in the order of a YOLOv8's outputs; each level goes row by row."""
+"""Pixels from anchor to anchor, in the order of a YOLOv8's outputs; each level is in row order."""
 _MAX_CANDIDATES = 1000
 """Boxes that enter the suppression; a trained network has some dozens above its threshold."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Letterbox:
-    """How an image was fitted into the network's input."""
+    """Placement of an image in the network's input."""
 
     image_hw: tuple[int, int]
     """(H, W) of the image [px]."""
@@ -31,11 +31,11 @@ class Letterbox:
     inner_hw: tuple[int, int]
     """(H, W) of the scaled image within it [px]."""
     top_left: tuple[int, int]
-    """Rows above and columns left of it [px]."""
+    """Rows above and columns left of the image [px]."""
 
     @classmethod
     def fit(cls, image_hw: tuple[int, int], input_hw: tuple[int, int]) -> Letterbox:
-        """Return the largest image of the same proportions, in the middle of the input."""
+        """Return the placement of the largest image of the same proportions, in the middle of the input."""
         gain = min(input_hw[0] / image_hw[0], input_hw[1] / image_hw[1])
         inner = (max(round(image_hw[0] * gain), 1), max(round(image_hw[1] * gain), 1))
         top, left = (round((whole - part) / 2 - 0.1) for whole, part in zip(input_hw, inner, strict=True))
@@ -52,15 +52,15 @@ class Letterbox:
         return cv2.dnn.blobFromImage(image, 1.0 / 255.0)
 
     def to_image(self, boxes: np.ndarray) -> np.ndarray:
-        """Return `boxes` (N, 4) of the input as boxes of the image, cut at its border [px]."""
+        """Return `boxes` (N, 4) of the input as boxes of the image, clipped to its border [px]."""
         top, left = self.top_left
         height, width = self.image_hw
-        gain_v, gain_u = self.inner_hw[0] / height, self.inner_hw[1] / width  # not quite equal: both were rounded
+        gain_v, gain_u = self.inner_hw[0] / height, self.inner_hw[1] / width  # not quite equal: both sizes were rounded
         boxes = (boxes - [left, top, left, top]) / [gain_u, gain_v, gain_u, gain_v]
         return np.clip(boxes, 0, [width, height, width, height])
 
     def mask(self, logits: np.ndarray) -> np.ndarray:
-        """Return where `logits` of a mask (h, w), over the whole input, are positive: (H, W) bool over the image."""
+        """Return the mask (H, W) bool over the image of positive `logits` (h, w) over the whole input."""
         if self.input_hw != self.image_hw:
             (top, left), (height, width) = self.top_left, self.inner_hw
             logits = cv2.resize(logits, self.input_hw[::-1], interpolation=cv2.INTER_LINEAR)
@@ -79,48 +79,48 @@ def read_outputs(
     max_detections: int,
     every_class: bool = False,
 ) -> list[Detection]:
-    """Return what the network's outputs say, most confident first.
+    """Return the detections in the network's outputs, most confident first.
 
     Args:
         rows: (4 + C + M, A) one column an anchor: centre and size of its box in the input [px], C confidences, M
             weights of the prototypes.
         prototypes: (M, h, w) of the masks; None from a network without.
         names: the C classes.
-        letterbox: how the image was fitted into the input.
-        min_confidence: what is not above this is dropped.
+        letterbox: placement of the image in the input.
+        min_confidence: minimum confidence, exclusive.
         max_iou: of two boxes of a class that overlap more than this, the less confident is dropped.
-        max_detections: at most so many are returned.
-        every_class: each class of an anchor is a detection of its own, not its likeliest alone.
+        max_detections: maximum number returned.
+        every_class: each class of an anchor is a detection of its own, not the likeliest alone.
     """
     scores = rows[4 : 4 + len(names)]
-    classes, anchors = _candidates(scores, min_confidence, every_class)
-    corners = _corners(rows[:4, anchors].T)
-    kept = _suppressed(corners, scores[classes, anchors], classes, max_iou)[:max_detections]
+    classes, anchors = _select_candidates(scores, min_confidence, every_class)
+    corners = _to_corners(rows[:4, anchors].T)
+    kept = _suppress_overlaps(corners, scores[classes, anchors], classes, max_iou)[:max_detections]
     boxes = letterbox.to_image(corners[kept])
     found = []
     for number, anchor, box in zip(classes[kept], anchors[kept], boxes, strict=True):
         mask = None
         if prototypes is not None:
             weights = rows[4 + len(names) :, anchor]
-            mask = _cut(letterbox.mask(np.tensordot(weights, prototypes, axes=1).astype(np.float32)), box)
-        edges = _whole_pixels(box)
+            mask = _crop_mask(letterbox.mask(np.tensordot(weights, prototypes, axes=1).astype(np.float32)), box)
+        edges = _grow_to_pixels(box)
         if edges[0] >= edges[2] or edges[1] >= edges[3] or (mask is not None and not mask.any()):
-            continue  # outside of the image, or nothing of it to be seen
+            continue  # outside of the image, or an empty mask
         confidence = float(scores[number, anchor])
         found.append(Detection(label=names[number], confidence=confidence, box_px=edges, mask=mask))
     return found
 
 
-def n_anchors(input_hw: tuple[int, int]) -> int:
-    """Return how many anchors a YOLOv8 has for an input (H, W) [px]."""
+def count_anchors(input_hw: tuple[int, int]) -> int:
+    """Return the number of anchors of a YOLOv8 for an input (H, W) [px]."""
     return sum((input_hw[0] // stride) * (input_hw[1] // stride) for stride in _STRIDES)
 
 
-def mean_of_mirrored(rows: np.ndarray, mirrored: np.ndarray, n_classes: int, input_hw: tuple[int, int]) -> np.ndarray:
-    """Return the mean of what a network says of an input and of its mirror image.
+def average_mirrored(rows: np.ndarray, mirrored: np.ndarray, n_classes: int, input_hw: tuple[int, int]) -> np.ndarray:
+    """Return the mean of a network's outputs for an input and for its mirror image.
 
-    Boxes and confidences are averaged anchor by anchor, each with the anchor at the mirrored place. The weights of
-    the prototypes stay: the mirror image's belong to prototypes of its own.
+    Boxes and confidences are averaged anchor by anchor, each with the anchor at the mirrored position. The weights of
+    the prototypes are kept: those of the mirror image belong to its own prototypes.
 
     Args:
         rows: (4 + C + M, A) of the input, see `read_outputs`.
@@ -142,8 +142,8 @@ def mean_of_mirrored(rows: np.ndarray, mirrored: np.ndarray, n_classes: int, inp
     return mean
 
 
-def _candidates(scores: np.ndarray, min_confidence: float, every_class: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Return the classes and the anchors whose `scores` (C, A) are high enough, most confident first."""
+def _select_candidates(scores: np.ndarray, min_confidence: float, every_class: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Return classes and anchors with `scores` (C, A) above the minimum, most confident first."""
     anchors = np.flatnonzero(scores.max(axis=0) > min_confidence)
     classes = scores[:, anchors].argmax(axis=0)
     if every_class:
@@ -152,8 +152,8 @@ def _candidates(scores: np.ndarray, min_confidence: float, every_class: bool) ->
     return classes[order], anchors[order]
 
 
-def _suppressed(corners: np.ndarray, scores: np.ndarray, classes: np.ndarray, max_iou: float) -> np.ndarray:
-    """Return which of the boxes `corners` (N, 4) survive within their class, most confident first."""
+def _suppress_overlaps(corners: np.ndarray, scores: np.ndarray, classes: np.ndarray, max_iou: float) -> np.ndarray:
+    """Return indices of the boxes `corners` (N, 4) that remain after suppression per class, most confident first."""
     if not len(corners):
         return np.empty(0, dtype=int)
     boxes = np.concatenate([corners[:, :2], corners[:, 2:] - corners[:, :2]], axis=1)
@@ -161,21 +161,21 @@ def _suppressed(corners: np.ndarray, scores: np.ndarray, classes: np.ndarray, ma
     return np.sort(np.asarray(kept, dtype=int).reshape(-1))
 
 
-def _corners(boxes: np.ndarray) -> np.ndarray:
+def _to_corners(boxes: np.ndarray) -> np.ndarray:
     """Return (N, 4) boxes given by centre and size as (u_min, v_min, u_max, v_max)."""
     boxes = boxes.astype(float)
     return np.concatenate([boxes[:, :2] - boxes[:, 2:] / 2, boxes[:, :2] + boxes[:, 2:] / 2], axis=1)
 
 
-def _cut(mask: np.ndarray, box: np.ndarray) -> np.ndarray:
-    """Return `mask` (H, W) without what lies outside `box` (u_min, v_min, u_max, v_max)."""
+def _crop_mask(mask: np.ndarray, box: np.ndarray) -> np.ndarray:
+    """Return `mask` (H, W) cropped to `box` (u_min, v_min, u_max, v_max)."""
     u_min, v_min, u_max, v_max = (int(edge) for edge in np.ceil(box))
     cut = np.zeros_like(mask)
     cut[v_min:v_max, u_min:u_max] = mask[v_min:v_max, u_min:u_max]
     return cut
 
 
-def _whole_pixels(box: np.ndarray) -> tuple[int, int, int, int]:
+def _grow_to_pixels(box: np.ndarray) -> tuple[int, int, int, int]:
     """Return `box` grown to whole pixels, upper ends exclusive."""
     u_min, v_min = np.floor(box[:2]).astype(int)
     u_max, v_max = np.ceil(box[2:]).astype(int)

@@ -1,4 +1,4 @@
-"""Detectors as torch modules: our own weights, or an ultralytics checkpoint; and their export to ONNX, made once."""
+"""Detectors as torch modules, from own weights or an ultralytics checkpoint, and their cached ONNX export."""
 
 from __future__ import annotations
 
@@ -9,35 +9,35 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from models.detector.weights import CAMERA_HW, MAKER, load_detector, tame_ultralytics
+from models.detector.weights import CAMERA_HW, TRAIN_COMMAND, disable_ultralytics_network, load_detector
 from models.torch_threads import single_threaded_workers
-from models.weights_file import WeightsError, checked_sha256, sha256_of
+from models.weights_file import WeightsError, sha256_of, verify_sha256
 
 MODULE_SUFFIXES = (".npz", ".pt")
-"""Files that hold a network's weights; the others hold a graph that a runtime reads."""
+"""Files with a network's weights; the others hold a graph for a runtime."""
 _EXPORT = "v1"
-"""Counts up when what is exported changes: older files are then made anew."""
+"""Version of the export: a change makes older files obsolete."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class DetectorModule:
-    """A network with its batch norms folded in."""
+    """Network with its batch norms folded in."""
 
     network: Any
-    """DetectionModel of ultralytics; gives (rows, prototypes), or rows alone when it knows no masks."""
+    """DetectionModel of ultralytics; gives (rows, prototypes), or rows alone without masks."""
     names: tuple[str, ...]
     """Classes in the order of the outputs."""
     input_hw: tuple[int, int]
-    """(H, W) of the images it is shown [px]."""
+    """(H, W) of its input [px]."""
 
 
 def load_module(path: Path) -> DetectorModule:
-    """Return the detector of a .npz of ours or of a .pt of ultralytics.
+    """Return the detector of this project's .npz or of ultralytics' .pt.
 
-    Of a .pt, which is a pickle, only ultralytics' and torch's own classes are made.
+    From a .pt, which is a pickle, only ultralytics' and torch's own classes are created.
 
     Raises:
-        WeightsError: the file is missing, damaged, or holds no detector that is understood.
+        WeightsError: the file is missing, damaged, or holds no supported detector.
     """
     network: Any
     if path.suffix == ".npz":
@@ -49,37 +49,37 @@ def load_module(path: Path) -> DetectorModule:
     for parameter in network.parameters():
         parameter.requires_grad_(False)
     head: Any = network.model[-1]
-    head.export = True  # plain outputs, without what only the training needs
+    head.export = True  # plain outputs, without those for training
     return DetectorModule(network=network, names=names, input_hw=input_hw)
 
 
-def exported(path: Path, folder: Path | None = None) -> Path:
+def export_to_onnx(path: Path, folder: Path | None = None) -> Path:
     """Return an ONNX file of the detector at `path` (.npz, .pt), made the first time and kept in `folder`.
 
-    Making it takes some seconds, nearly all of them to load torch and ultralytics, which nobody needs afterwards.
+    The export takes some seconds, nearly all of them to load torch and ultralytics, which inference does not need.
 
     Args:
         path: the weights.
-        folder: where to keep it; by default the user's cache.
+        folder: cache of the file; by default the user's.
 
     Raises:
         WeightsError: as `load_module`.
     """
-    digest = checked_sha256(path, MAKER) if path.suffix == ".npz" else sha256_of(path)
+    digest = verify_sha256(path, TRAIN_COMMAND) if path.suffix == ".npz" else sha256_of(path)
     target = (folder or cache_folder()) / f"{path.stem}-{digest[:16]}-{_EXPORT}.onnx"
     if not target.is_file():
         partial = target.with_name(f".{target.name}.{os.getpid()}")
         try:
             with single_threaded_workers(1, "export") as worker:
                 worker.submit(lambda: _export(load_module(path), partial)).result()
-            partial.replace(target)  # nobody ever sees half of it
+            partial.replace(target)  # atomic: no reader gets half a file
         finally:
             partial.unlink(missing_ok=True)
     return target
 
 
 def cache_folder() -> Path:
-    """Return the folder for what can be made again: the user's, or, where that cannot be written, a new one in /tmp."""
+    """Return the user's cache folder, or a new temporary one where that cannot be written."""
     home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     folder = home / "z1-grasp"
     try:
@@ -91,18 +91,23 @@ def cache_folder() -> Path:
 
 
 def _load_checkpoint(path: Path) -> tuple[Any, tuple[str, ...]]:
-    tame_ultralytics()
+    disable_ultralytics_network()
     from ultralytics.nn.tasks import torch_safe_load
 
     try:
         checkpoint, _ = torch_safe_load(str(path), safe_only=True)
         network: Any = checkpoint.get("ema") or checkpoint["model"]
         head = type(network.model[-1]).__name__
-    except Exception as err:  # whatever unpickling a stranger's file ends in
+    except Exception as err:  # unpickling a foreign file raises errors without a common class
         reason = str(err).splitlines()[0][:120] if str(err) else type(err).__name__
-        raise WeightsError(f"{path.name} is no checkpoint of ultralytics' YOLO ({reason}).") from err
+        raise WeightsError(
+            f"{path.name} is no checkpoint of ultralytics' YOLO ({reason}).", code="not_a_checkpoint"
+        ) from err
     if head not in ("Detect", "Segment") or network.model[-1].end2end:
-        raise WeightsError(f"{path.name} ends in a {head}; a YOLOv8 (or 11) that detects or segments is understood.")
+        raise WeightsError(
+            f"{path.name} ends in a {head}; a YOLOv8 (or 11) that detects or segments is supported.",
+            code="unsupported_head",
+        )
     return network.float(), tuple(network.names[i] for i in range(len(network.names)))
 
 
@@ -113,7 +118,7 @@ def _export(module: DetectorModule, path: Path) -> None:
     outputs = ["output0", "output1"][: 2 if hasattr(module.network.model[-1], "proto") else 1]
     image = torch.zeros(1, 3, *module.input_hw)
     with warnings.catch_warnings(), torch.no_grad():
-        # The exporter through torch.export takes ten times as long and wants another package.
+        # The exporter through torch.export takes ten times as long and needs another package.
         warnings.simplefilter("ignore")
         torch.onnx.export(
             module.network,
@@ -125,7 +130,7 @@ def _export(module: DetectorModule, path: Path) -> None:
             output_names=outputs,
         )
     model = onnx.load(path)
-    # As ultralytics writes it, so that this file and a user's are read alike.
+    # In ultralytics' format, so that one reader serves this file and a user's.
     values = {"names": str(dict(enumerate(module.names))), "task": "segment" if len(outputs) == 2 else "detect"}
     onnx.helper.set_model_props(model, values)
     onnx.save(model, path)

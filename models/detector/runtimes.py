@@ -1,4 +1,4 @@
-"""Runs a detector's network by OpenVINO, ONNX Runtime or torch; all give the same numbers."""
+"""Detector networks in OpenVINO, ONNX Runtime or torch, with the same outputs."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from typing import Any, Protocol
 import numpy as np
 
 from hal.base.errors import InvalidValueError
-from models.detector.modules import MODULE_SUFFIXES, exported, load_module
+from models.detector.modules import MODULE_SUFFIXES, export_to_onnx, load_module
 from models.detector.weights import CAMERA_HW, detector_path
 from models.torch_threads import has_bfloat16, single_threaded_workers
 from models.weights_file import WeightsError
 
 _PACKAGES = {"openvino": ("openvino",), "onnxruntime": ("onnxruntime",), "torch": ("torch", "ultralytics")}
 RUNTIMES = tuple(_PACKAGES)
-"""The quickest on a CPU first, as measured on x86-64; `./z1 doctor` measures this machine."""
+"""Fastest on a CPU first, as measured on x86-64; `./z1 doctor` measures this machine."""
 _THREADS = 2
-"""More help little, and the servo and the camera want cores of their own."""
+"""More threads help little, and servo and camera need cores of their own."""
 
 
-class Network(Protocol):
-    """A network that is ready to look."""
+class DetectorNetwork(Protocol):
+    """Network that is ready for inference."""
 
     runtime: str
     """One of `RUNTIMES`."""
@@ -52,36 +52,39 @@ def installed_runtimes(weights: Path | None = None) -> tuple[str, ...]:
     return tuple(name for name, packages in wanted.items() if all(find_spec(package) for package in packages))
 
 
-def open_network(weights: Path | None = None, runtime: str = "auto") -> Network:
-    """Return the network of a file, in the first of `RUNTIMES` that is installed, or in the one that is named.
+def open_network(weights: Path | None = None, runtime: str = "auto") -> DetectorNetwork:
+    """Return the network of a file, in the first of `RUNTIMES` that is installed, or in `runtime`.
 
     Args:
-        weights: .npz of ours, .pt of ultralytics, .onnx, or OpenVINO's .xml or the folder that holds one; None takes
-            the shipped one.
+        weights: this project's .npz, ultralytics' .pt, .onnx, or OpenVINO's .xml or the folder that holds one; None
+            takes the shipped file.
         runtime: one of `RUNTIMES`, or `auto`.
 
     Raises:
-        WeightsError: the file is missing, damaged, or holds no detector that is understood.
-        ValueError: that runtime is unknown, not installed, or cannot run this kind of file.
+        WeightsError: the file is missing, damaged, or holds no supported detector.
+        InvalidValueError: that runtime is unknown, not installed, or cannot run this kind of file.
     """
-    path = _found(weights or detector_path())
-    able = installed_runtimes(path)
+    path = _resolve_path(weights or detector_path())
+    runnable = installed_runtimes(path)
     if runtime not in ("auto", *RUNTIMES):
-        raise InvalidValueError(f"there is no detector runtime {runtime!r}; known: auto, {', '.join(RUNTIMES)}.")
-    if not able or runtime not in ("auto", *able):
         raise InvalidValueError(
-            f"{path.name} cannot be run by {'anything here' if runtime == 'auto' else runtime}; installed and able: "
-            f"{', '.join(able) or 'none'}. To install the others: uv sync --extra fast-detector."
+            f"there is no detector runtime {runtime!r}; known: auto, {', '.join(RUNTIMES)}.", code="unknown_runtime"
         )
-    chosen = able[0] if runtime == "auto" else runtime
+    if not runnable or runtime not in ("auto", *runnable):
+        raise InvalidValueError(
+            f"{path.name} cannot be run by {'anything here' if runtime == 'auto' else runtime}; installed for it: "
+            f"{', '.join(runnable) or 'none'}. To install the others: uv sync --extra fast-detector.",
+            code="runtime_unavailable",
+        )
+    chosen = runnable[0] if runtime == "auto" else runtime
     if chosen == "torch":
-        return _tried(TorchNetwork(path), path)
-    graph = exported(path) if path.suffix in MODULE_SUFFIXES else path
-    return _tried(OpenVinoNetwork(graph) if chosen == "openvino" else OnnxNetwork(graph), path)
+        return _check_outputs(TorchNetwork(path), path)
+    graph = export_to_onnx(path) if path.suffix in MODULE_SUFFIXES else path
+    return _check_outputs(OpenVinoNetwork(graph) if chosen == "openvino" else OnnxNetwork(graph), path)
 
 
 class OpenVinoNetwork:
-    """An .onnx or .xml in OpenVINO, in bfloat16 where the processor computes in it."""
+    """Network from an .onnx or .xml in OpenVINO, in bfloat16 where the processor has it."""
 
     runtime = "openvino"
 
@@ -93,30 +96,30 @@ class OpenVinoNetwork:
         try:
             model = core.read_model(path)
         except RuntimeError as err:
-            raise _unreadable(path, err) from err
+            raise _unreadable_error(path, err) from err
         shape = model.inputs[0].get_partial_shape()
         self.input_hw = _input_hw([dim.get_length() if dim.is_static else None for dim in shape], path)
         model.reshape([1, 3, *self.input_hw])
         self.names = _class_names(_openvino_metadata(model, path), path)
-        quick = "BF16" in core.get_property("CPU", "OPTIMIZATION_CAPABILITIES")
+        use_bfloat16 = "BF16" in core.get_property("CPU", "OPTIMIZATION_CAPABILITIES")
         settings = {
             "INFERENCE_NUM_THREADS": min(_THREADS, os.cpu_count() or 1),
-            "INFERENCE_PRECISION_HINT": "bf16" if quick else "f32",
+            "INFERENCE_PRECISION_HINT": "bf16" if use_bfloat16 else "f32",
             "PERFORMANCE_HINT": "LATENCY",
-            "ENABLE_CPU_PINNING": False,  # the scheduler knows where the servo's thread runs
+            "ENABLE_CPU_PINNING": False,  # pinned threads could share a core with the servo's
         }
         self._compiled = core.compile_model(model, "CPU", settings)
 
     def run(self, blob: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
-        """Return rows and prototypes; see `Network.run`."""
-        request = self._compiled.create_infer_request()  # each caller its own: several threads may look
+        """Return rows and prototypes; see `DetectorNetwork.run`."""
+        request = self._compiled.create_infer_request()  # one for each call: several threads may call
         request.infer({0: blob})
         outputs = [request.get_output_tensor(i).data.copy() for i in range(len(self._compiled.outputs))]
         return _split(outputs)
 
 
 class OnnxNetwork:
-    """An .onnx in ONNX Runtime."""
+    """Network from an .onnx in ONNX Runtime."""
 
     runtime = "onnxruntime"
 
@@ -130,20 +133,20 @@ class OnnxNetwork:
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # the servo needs that core
         try:
             self._session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
-        except Exception as err:  # its errors share no class
-            raise _unreadable(path, err) from err
+        except Exception as err:  # ONNX Runtime's errors have no common class
+            raise _unreadable_error(path, err) from err
         entry = self._session.get_inputs()[0]
         self._input = entry.name
         self.input_hw = _input_hw([size if isinstance(size, int) else None for size in entry.shape], path)
         self.names = _class_names(self._session.get_modelmeta().custom_metadata_map, path)
 
     def run(self, blob: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
-        """Return rows and prototypes; see `Network.run`."""
+        """Return rows and prototypes; see `DetectorNetwork.run`."""
         return _split(self._session.run(None, {self._input: blob}))
 
 
 class TorchNetwork:
-    """A .npz of ours or a .pt of ultralytics in torch, in bfloat16 where the processor computes in it."""
+    """Network from this project's .npz or ultralytics' .pt in torch, in bfloat16 where the processor has it."""
 
     runtime = "torch"
 
@@ -154,36 +157,43 @@ class TorchNetwork:
         module = load_module(path)
         self.names, self.input_hw = module.names, module.input_hw
         self._network = module.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        self._quick = has_bfloat16()
+        self._use_bfloat16 = has_bfloat16()
         self._worker = single_threaded_workers(1, "detector")
 
     def run(self, blob: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
-        """Return rows and prototypes; see `Network.run`."""
+        """Return rows and prototypes; see `DetectorNetwork.run`."""
         return self._worker.submit(self._run, blob).result()
 
     def _run(self, blob: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
         import torch
 
         image = torch.from_numpy(blob).to(memory_format=torch.channels_last)
-        with torch.inference_mode(), torch.autocast("cpu", dtype=torch.bfloat16, enabled=self._quick):
+        with torch.inference_mode(), torch.autocast("cpu", dtype=torch.bfloat16, enabled=self._use_bfloat16):
             outputs = self._network(image)
         outputs = outputs if isinstance(outputs, tuple) else (outputs,)
         return _split([output.float().numpy() for output in outputs])
 
 
-def _found(path: Path) -> Path:
-    """Return the file that is meant by `path`: of a folder, its one .xml."""
+def _resolve_path(path: Path) -> Path:
+    """Return the file at `path`: for a folder, its only .xml."""
     if path.is_dir():
         graphs = sorted(path.glob("*.xml"))
         if len(graphs) != 1:
-            raise WeightsError(f"the folder {path} holds {len(graphs)} .xml files; an OpenVINO export holds one.")
+            raise WeightsError(
+                f"the folder {path} holds {len(graphs)} .xml files; an OpenVINO export holds one.",
+                code="not_an_openvino_folder",
+            )
         path = graphs[0]
     if path.suffix not in (*MODULE_SUFFIXES, ".onnx", ".xml"):
         raise WeightsError(
-            f"{path} is no detector; known: .npz (ours), .pt (ultralytics), .onnx, and OpenVINO's .xml or its folder."
+            f"{path} is no detector; known: .npz (this project), .pt (ultralytics), .onnx, and OpenVINO's .xml or its "
+            "folder.",
+            code="unknown_weights",
         )
-    if path.suffix != ".npz" and not path.is_file():  # of ours, another message says how to make it
-        raise WeightsError(f"{path} is missing; nothing is downloaded: put the file there, or name another.")
+    if path.suffix != ".npz" and not path.is_file():  # the reader of .npz names the command that makes it
+        raise WeightsError(
+            f"{path} is missing; nothing is downloaded: put the file there, or name another.", code="weights_missing"
+        )
     return path
 
 
@@ -193,28 +203,31 @@ def _split(outputs: Sequence[Any]) -> tuple[np.ndarray, np.ndarray | None]:
 
 def _input_hw(shape: list[int | None], path: Path) -> tuple[int, int]:
     if len(shape) != 4 or shape[1] not in (3, None) or shape[0] not in (1, None):
-        raise WeightsError(f"{path.name} takes {shape}; a detector takes one image (1, 3, H, W).")
+        raise WeightsError(
+            f"{path.name} takes {shape}; a detector takes one image (1, 3, H, W).", code="unsupported_input"
+        )
     return shape[2] or CAMERA_HW[0], shape[3] or CAMERA_HW[1]
 
 
 def _class_names(metadata: Mapping[str, str], path: Path) -> tuple[str, ...]:
-    """Return the classes that ultralytics writes into an export, as the text of {index: name}."""
+    """Return the classes that ultralytics writes into an export, as text of {index: name}."""
     try:
         names = ast.literal_eval(metadata["names"])
         return tuple(str(names[i]) for i in range(len(names)))
     except (KeyError, ValueError, SyntaxError, TypeError) as err:
         raise WeightsError(
-            f"{path.name} does not say its classes; export it by ultralytics (yolo export), which writes them down."
+            f"{path.name} names no classes; export it by ultralytics (yolo export), which writes them into the file.",
+            code="no_class_names",
         ) from err
 
 
 def _openvino_metadata(model: Any, path: Path) -> dict[str, str]:
-    """Return what the export says of itself: in the .onnx, or in ultralytics' metadata.yaml beside the .xml."""
-    beside = path.with_name("metadata.yaml")
-    if path.suffix == ".xml" and beside.is_file():
+    """Return the metadata of an export: in the .onnx, or in ultralytics' metadata.yaml next to the .xml."""
+    metadata = path.with_name("metadata.yaml")
+    if path.suffix == ".xml" and metadata.is_file():
         import yaml
 
-        data = yaml.safe_load(beside.read_text())
+        data = yaml.safe_load(metadata.read_text())
         return {key: str(value) for key, value in data.items()} if isinstance(data, dict) else {}
     try:
         return {"names": model.get_rt_info(["framework", "names"]).astype(str)}
@@ -222,23 +235,24 @@ def _openvino_metadata(model: Any, path: Path) -> dict[str, str]:
         return {}
 
 
-def _tried(network: Network, path: Path) -> Network:
-    """Return `network` after a first look at nothing, if its outputs are YOLOv8's."""
+def _check_outputs(network: DetectorNetwork, path: Path) -> DetectorNetwork:
+    """Return `network` after a run on an empty image, if its outputs are YOLOv8's."""
     try:
         rows, prototypes = network.run(np.zeros((1, 3, *network.input_hw), np.float32))
-    except Exception as err:  # the runtimes' errors share no class
-        raise _unreadable(path, err) from err
+    except Exception as err:  # the runtimes' errors have no common class
+        raise _unreadable_error(path, err) from err
     n_masks = 0 if prototypes is None else len(prototypes)
     flat = rows.ndim == 2 and (prototypes is None or prototypes.ndim == 3)
     if not flat or len(rows) != 4 + len(network.names) + n_masks:
-        seen = ", ".join(str(output.shape) for output in (rows, prototypes) if output is not None)
+        shapes = ", ".join(str(output.shape) for output in (rows, prototypes) if output is not None)
         raise WeightsError(
-            f"{path.name} gives {seen} for an image and {len(network.names)} classes; a YOLOv8 that detects or "
-            f"segments, exported without nms, gives ({4 + len(network.names)} + M, A) and, with masks, (M, h, w)."
+            f"{path.name} gives {shapes} for an image and {len(network.names)} classes; a YOLOv8 that detects or "
+            f"segments, exported without nms, gives ({4 + len(network.names)} + M, A) and, with masks, (M, h, w).",
+            code="unsupported_output",
         )
     return network
 
 
-def _unreadable(path: Path, err: Exception) -> WeightsError:
+def _unreadable_error(path: Path, err: Exception) -> WeightsError:
     reason = str(err).strip().splitlines()[-1][:160]
-    return WeightsError(f"{path.name} cannot be read as a detector's graph: {reason}")
+    return WeightsError(f"{path.name} cannot be read as a detector's graph: {reason}", code="unreadable_graph")

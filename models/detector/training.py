@@ -1,13 +1,13 @@
-"""YOLOv8n-seg trained on a CPU: ultralytics' trainer, with the network in bfloat16 and the loss in float32."""
+"""Training of YOLOv8n-seg on a CPU: ultralytics' trainer, with the network in bfloat16 and the loss in float32."""
 
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from models.detector.weights import ARCHITECTURE, new_network, tame_ultralytics
+from models.detector.weights import ARCHITECTURE, disable_ultralytics_network, new_network
 
-tame_ultralytics()  # before ultralytics is loaded
+disable_ultralytics_network()  # ultralytics reads the variables when it is imported
 
 import torch  # noqa: E402
 import ultralytics.utils  # noqa: E402
@@ -17,8 +17,8 @@ from ultralytics.nn.tasks import SegmentationModel  # noqa: E402
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Phase:
-    """One run at one picture size; each phase starts from the weights of the one before."""
+class TrainingPhase:
+    """Training run at one picture size; each phase starts from the weights of the one before."""
 
     imgsz: int
     """Longer side of the pictures [px]."""
@@ -26,21 +26,21 @@ class Phase:
     lr0: float
     """Learning rate after the warm-up."""
     lrf: float
-    """Share of `lr0` at the end; a straight line between, in steps of one batch."""
+    """Ratio of the final rate to `lr0`; linear in between, in steps of one batch."""
     warmup_epochs: float
     batch: int = 16
     fraction: int | float = 12_000
-    """How many pictures, the first of those that are there; or which share of them."""
+    """Number of pictures, the first of the data set, or their fraction of it."""
 
 
-PHASES = (
-    Phase(imgsz=192, epochs=12, lr0=2.0e-3, lrf=0.8, warmup_epochs=1.0),
-    Phase(imgsz=256, epochs=9, lr0=1.6e-3, lrf=0.75, warmup_epochs=0.2),
-    Phase(imgsz=320, epochs=11, lr0=1.2e-3, lrf=0.02, warmup_epochs=0.2),
-    Phase(imgsz=320, epochs=2, lr0=6.0e-4, lrf=0.02, warmup_epochs=0.1, fraction=1.0),
+TRAINING_PHASES = (
+    TrainingPhase(imgsz=192, epochs=12, lr0=2.0e-3, lrf=0.8, warmup_epochs=1.0),
+    TrainingPhase(imgsz=256, epochs=9, lr0=1.6e-3, lrf=0.75, warmup_epochs=0.2),
+    TrainingPhase(imgsz=320, epochs=11, lr0=1.2e-3, lrf=0.02, warmup_epochs=0.2),
+    TrainingPhase(imgsz=320, epochs=2, lr0=6.0e-4, lrf=0.02, warmup_epochs=0.1, fraction=1.0),
 )
-"""Small pictures teach most of it at a fraction of the time; the last have the size at which the network is used. The
-learning rate falls all the way, and once more over the last passes, for which there are more pictures."""
+"""Small pictures give most of the accuracy at a fraction of the time; the last have the size of the network's use. The
+learning rate falls throughout, and once more over the last passes, which have more pictures."""
 
 AUGMENTATION = {
     "hsv_h": 0.03,
@@ -52,14 +52,14 @@ AUGMENTATION = {
     "fliplr": 0.5,
     "mosaic": 0.0,
 }
-"""On top of what the scenes vary themselves. No mosaic: four scenes of a quarter's size are not what the arm sees."""
+"""In addition to the scenes' own variety. No mosaic: the camera never shows four scenes at a quarter of the size."""
 
 GAINS = {"cls": 1.0}
-"""Of the loss, where they are not ultralytics' own: outlines are good early, what is an object is learnt last."""
+"""Gains of the loss other than ultralytics': outlines are good early, the class is learnt last."""
 
 
 class Bf16SegmentationModel(SegmentationModel):
-    """The network runs in bfloat16 (twice as fast where the processor has AVX-512 BF16), its loss in float32."""
+    """Segmentation network in bfloat16 (twice as fast with AVX-512 BF16), with its loss in float32."""
 
     def loss(self, batch, preds=None):
         """Return ultralytics' loss and its parts."""
@@ -92,16 +92,16 @@ class CpuSegmentationTrainer(SegmentationTrainer):
         return batch
 
     def _setup_train(self) -> None:
-        """Prepare, then start all processes from the first one's weights."""
+        """Prepare the training, then copy the first process's weights to all."""
         super()._setup_train()
         if distributed.is_initialized():
             for value in self.model.state_dict().values():
                 distributed.broadcast(value, 0)
 
     def optimizer_step(self) -> None:
-        """Step, with the mean gradient of all processes and the learning rate of this very batch.
+        """Step with the mean gradient of all processes and the learning rate of this batch.
 
-        Ultralytics' own rate falls once an epoch, and its own processes want a GPU each.
+        Ultralytics' own rate falls once an epoch, and its own processes need a GPU each.
         """
         if distributed.is_initialized():
             self._average_gradients()
@@ -121,23 +121,23 @@ class CpuSegmentationTrainer(SegmentationTrainer):
             gradient.copy_(mean.view_as(gradient))
 
     def validate(self):
-        """Skip: held-out pictures are for the measurement after the training alone."""
+        """Skip the validation: held-out pictures are used after the training only."""
         return {}, float(self.epoch)
 
     def final_eval(self) -> None:
-        """Skip, for the same reason; the checkpoint stays as it is."""
+        """Skip the evaluation for the same reason; the checkpoint is unchanged."""
 
 
-def train_phase(phase: Phase, *, data: Path, folder: Path, start: Path | None, seed: int, threads: int) -> Path:
-    """Train one phase, or what is left of it, and return its last checkpoint.
+def train_phase(phase: TrainingPhase, *, data: Path, folder: Path, start: Path | None, seed: int, threads: int) -> Path:
+    """Train one phase, or the rest of it, and return its last checkpoint.
 
-    Where a process group of torch.distributed is there (RANK, LOCAL_RANK and WORLD_SIZE set before ultralytics is
-    imported), its processes share each batch.
+    With a process group of torch.distributed (RANK, LOCAL_RANK and WORLD_SIZE set before ultralytics is imported),
+    its processes share each batch.
 
     Args:
-        phase: what to do.
+        phase: size, epochs and rates.
         data: ultralytics' description of the data set (`data.yaml`).
-        folder: of this phase; a checkpoint in it is taken up where it stopped.
+        folder: of this phase; a checkpoint in it is resumed.
         start: checkpoint of the phase before; None = from scratch.
         seed: of weights, order and augmentation.
         threads: of torch.
@@ -154,19 +154,19 @@ def train_phase(phase: Phase, *, data: Path, folder: Path, start: Path | None, s
     settings["batch"] = phase.batch // (distributed.get_world_size() if distributed.is_initialized() else 1)
     settings["cache"] = "ram"  # the pictures at the phase's size: 0.7 to 3 GB
     if distributed.is_initialized() and distributed.get_rank() != ultralytics.utils.RANK:
-        raise RuntimeError("ultralytics does not know of the other processes, so each would see all pictures.")
+        raise RuntimeError("ultralytics does not know the other processes, so each would process all pictures.")
     trainer = CpuSegmentationTrainer(overrides=settings)
     trainer.add_callback("on_train_start", lambda _: torch.set_num_threads(threads))
     trainer.world_size = 1 if distributed.is_initialized() else 0  # gradients are averaged here, not summed there
     trainer.train()
     if distributed.is_initialized():
-        distributed.barrier()  # the first has written what the others go on from
+        distributed.barrier()  # the others resume from the checkpoint that the first writes
     (folder / "done").touch()
     return last
 
 
 def read_checkpoint(path: Path) -> torch.nn.Module:
-    """Return the averaged weights of a checkpoint of ours in a plain float32 network."""
+    """Return the averaged weights of a checkpoint of `train_phase` in a plain float32 network."""
     saved = torch.load(path, map_location="cpu", weights_only=False)["ema"].float()
     model = new_network(len(saved.names))
     model.load_state_dict(saved.state_dict())

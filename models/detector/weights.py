@@ -1,4 +1,4 @@
-"""The detector's own weights on disk: YOLOv8n-seg as plain arrays, with the names of its classes and a checksum."""
+"""Weights of the shipped detector on disk: YOLOv8n-seg as plain arrays, with its class names and a checksum."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ if TYPE_CHECKING:
     from torch import nn
 
 CLASSES = ("bottle", "cylinder", "box")
-"""What the shipped detector tells apart, in the order of its outputs."""
+"""Classes of the shipped detector, in the order of its outputs."""
 ARCHITECTURE = "yolov8n-seg"
 INPUT_HW = (256, 320)
-"""(H, W) to which images are scaled before it looks [px]: what its training ends at, in whole strides of 32."""
+"""(H, W) of its input [px]: the size at the end of its training, in multiples of the stride of 32."""
 CAMERA_HW = (480, 640)
-"""(H, W) of the D405's images [px], which other networks are shown as they are if they have no size of their own."""
-MAKER = "python -m scripts.train.train_detector"
+"""(H, W) of the D405's images [px], the input size of networks that have none of their own."""
+TRAIN_COMMAND = "python -m scripts.train.train_detector"
 """The command that makes the weights."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LoadedDetector:
-    """A network and what its outputs mean."""
+    """Network and the meaning of its outputs."""
 
     network: nn.Module
     """SegmentationModel of ultralytics, in evaluation mode, float32, not fused."""
@@ -39,7 +39,7 @@ class LoadedDetector:
 
 
 def detector_path() -> Path:
-    """Return where the shipped detector's weights lie."""
+    """Return the path of the shipped detector's weights."""
     return WEIGHTS_FOLDER / "detector.npz"
 
 
@@ -49,10 +49,10 @@ def save_detector(
     names: Sequence[str] | Mapping[int, str] = CLASSES,
     input_hw: tuple[int, int] = INPUT_HW,
 ) -> str:
-    """Write a trained YOLOv8n-seg to `path` (.npz) and its SHA-256 beside it; return the latter.
+    """Write a trained YOLOv8n-seg to `path` (.npz) and its SHA-256 next to it; return the latter.
 
-    Matrices and kernels are kept in half precision. Vectors, above all the variances of the batch norms, whose range is
-    wider than that of half precision, stay as they are: they are one hundredth of it all.
+    Matrices and kernels are kept in half precision. Vectors keep theirs: the variances of the batch norms exceed the
+    range of half precision, and all vectors together are one hundredth of the file.
 
     Args:
         path: the file, ending in .npz.
@@ -65,12 +65,15 @@ def save_detector(
     """
     names = tuple(names[i] for i in range(len(names)))
     state = {key: value.detach().cpu().numpy() for key, value in model.state_dict().items()}
-    with np.errstate(over="ignore"):  # asked for next
+    with np.errstate(over="ignore"):  # checked next
         arrays = {f"network/{key}": _compact(value) for key, value in state.items()}
     for key, value in arrays.items():
         if not np.isfinite(value).all():
-            raise WeightsError(f"{key} of the model is not finite in half precision; the training went astray.")
-    _network(arrays, len(names), f"the model for {path.name}")  # nothing is written that could not be read
+            raise WeightsError(
+                f"{key} of the model is not finite in half precision; the training has diverged.",
+                code="weights_not_finite",
+            )
+    _build_network(arrays, len(names), f"the model for {path.name}")  # a file that cannot be read is not written
     return write_arrays(
         path,
         {"architecture": np.array(ARCHITECTURE), "names": np.array(names), "input_hw": np.array(input_hw), **arrays},
@@ -78,31 +81,34 @@ def save_detector(
 
 
 def load_detector(path: Path) -> LoadedDetector:
-    """Return the network of the file at `path`, ready to look.
+    """Return the network of the file at `path`, in evaluation mode.
 
     Raises:
-        WeightsError: the file or its checksum is missing, they do not agree, or the file is of another network.
+        WeightsError: the file or its checksum is missing, they differ, or the file is of another network.
     """
-    arrays = read_arrays(path, MAKER)
+    arrays = read_arrays(path, TRAIN_COMMAND)
     if lacking := [key for key in ("architecture", "names", "input_hw") if key not in arrays]:
-        raise WeightsError(f"{path.name} is no detector: it lacks {', '.join(lacking)}.")
+        raise WeightsError(f"{path.name} is no detector: it lacks {', '.join(lacking)}.", code="weights_incomplete")
     if (architecture := str(arrays["architecture"])) != ARCHITECTURE:
-        raise WeightsError(f"{path.name} holds a {architecture}; this version reads {ARCHITECTURE}.")
+        raise WeightsError(
+            f"{path.name} holds a {architecture}; this version reads {ARCHITECTURE}.", code="weights_other_network"
+        )
     names = tuple(str(name) for name in arrays["names"])
     height, width = (int(size) for size in arrays["input_hw"])
-    return LoadedDetector(network=_network(arrays, len(names), path.name), names=names, input_hw=(height, width))
+    network = _build_network(arrays, len(names), path.name)
+    return LoadedDetector(network=network, names=names, input_hw=(height, width))
 
 
 def new_network(n_classes: int) -> nn.Module:
     """Return an untrained YOLOv8n-seg for `n_classes`, in evaluation mode."""
-    tame_ultralytics()
+    disable_ultralytics_network()
     from ultralytics.nn.tasks import SegmentationModel
 
     return SegmentationModel(f"{ARCHITECTURE}.yaml", ch=3, nc=n_classes, verbose=False).eval()
 
 
-def tame_ultralytics() -> None:
-    """Keep ultralytics, which is imported after this, from installing packages, asking its servers, and talking."""
+def disable_ultralytics_network() -> None:
+    """Disable installation, network access and output of ultralytics; call it before ultralytics is imported."""
     os.environ.setdefault("YOLO_AUTOINSTALL", "false")
     os.environ.setdefault("YOLO_VERBOSE", "false")
     os.environ.setdefault("YOLO_OFFLINE", "true")
@@ -114,8 +120,8 @@ def _compact(value: np.ndarray) -> np.ndarray:
     return value.astype(np.float16 if value.ndim > 1 else np.float32)
 
 
-def _network(arrays: Mapping[str, np.ndarray], n_classes: int, what: str) -> nn.Module:
-    """Return the network filled with those of `arrays` that are its own."""
+def _build_network(arrays: Mapping[str, np.ndarray], n_classes: int, name: str) -> nn.Module:
+    """Return the network with its part of `arrays`; `name` is that of their source in errors."""
     import torch
 
     state = {
@@ -128,5 +134,8 @@ def _network(arrays: Mapping[str, np.ndarray], n_classes: int, what: str) -> nn.
         network.load_state_dict(state)
     except RuntimeError as err:
         first = "; ".join(line.strip() for line in str(err).splitlines()[1:2])
-        raise WeightsError(f"{what} is not a {ARCHITECTURE} (not fused) of {n_classes} classes: {first[:200]}") from err
+        raise WeightsError(
+            f"{name} is not a {ARCHITECTURE} (not fused) of {n_classes} classes: {first[:200]}",
+            code="weights_other_network",
+        ) from err
     return network

@@ -1,4 +1,4 @@
-"""What the networks see: a thinned cloud with normals in a frame that turns and moves with camera and object."""
+"""Input of the networks: a thinned cloud with normals in a frame fixed to the view ray and the object."""
 
 from __future__ import annotations
 
@@ -9,35 +9,37 @@ from numba import njit
 from scipy.spatial import KDTree
 
 N_POINTS = 512
+"""Points in the networks' input."""
 N_TOKENS = 48
+"""Points that a grasp attends to; the first of the input."""
 _N_FOR_NORMALS = 1024
 _NEIGHBOURS = 16
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ViewCloud:
-    """One object's visible points, ready for the networks."""
+    """Visible points of one object in the networks' input format."""
 
     points: np.ndarray
-    """(512, 3) in the view frame [m]; the first 48 are spread furthest apart."""
+    """(512, 3) in the view frame [m]; the first 48 by farthest point sampling."""
     normals: np.ndarray
     """(512, 3) unit, towards the camera, in the view frame."""
     T_camera_view: np.ndarray
-    """(4, 4) pose of the view frame: origin at the centroid, z away from the camera, x along the longest extent."""
+    """(4, 4) pose of the view frame: origin at the centroid, z along the view ray, x along the longest extent."""
 
 
 def prepare_cloud(points: np.ndarray, rng: np.random.Generator) -> ViewCloud:
-    """Return the cloud of `points` (M, 3), seen from their origin, as the networks want it.
+    """Return `points` (M, 3), seen from their origin, as input of the networks.
 
     The view frame is fixed to the view ray and to the cloud's own longest extent across it, so that turning the camera
-    about any axis turns the grasps and changes nothing else. No gravity, table or image axis goes in.
+    about any axis turns the grasps and changes nothing else. Gravity, table and image axes are not used.
     """
     T_camera_view = find_view_frame(points)
     kept = points[rng.permutation(len(points))[:_N_FOR_NORMALS]]
     local = (kept - T_camera_view[:3, 3]) @ T_camera_view[:3, :3]
     normals = _estimate_normals(local, float(np.linalg.norm(T_camera_view[:3, 3])))
     drawn = np.resize(rng.permutation(len(local)), N_POINTS)  # a smaller cloud repeats its points
-    first = _spread_first(local[drawn])
+    first = _sample_farthest(local[drawn])
     index = np.concatenate([drawn[first], np.delete(drawn, np.unique(first))])[:N_POINTS]
     index = np.resize(index, N_POINTS)
     return ViewCloud(points=local[index], normals=normals[index], T_camera_view=T_camera_view)
@@ -61,7 +63,7 @@ def find_view_frame(points: np.ndarray) -> np.ndarray:
 
 
 def _estimate_normals(local: np.ndarray, distance_m: float) -> np.ndarray:
-    """Return unit normals (N, 3) that face the camera, which stands at (0, 0, −distance)."""
+    """Return unit normals (N, 3) towards the camera at (0, 0, −distance)."""
     _, near = KDTree(local).query(local, k=min(_NEIGHBOURS, len(local)))
     patches = local[near]
     patches = patches - patches.mean(axis=1, keepdims=True)
@@ -72,8 +74,8 @@ def _estimate_normals(local: np.ndarray, distance_m: float) -> np.ndarray:
 
 
 @njit(cache=True)
-def _spread_first(points):
-    """Return indices (48,) of points that lie furthest apart (farthest point sampling)."""
+def _sample_farthest(points):
+    """Return indices (48,) of points by farthest point sampling."""
     chosen = np.zeros(N_TOKENS, dtype=np.int64)
     gap = np.full(len(points), 1e9)
     for k in range(1, N_TOKENS):

@@ -1,4 +1,4 @@
-"""The two networks: a denoiser of grasps and a judge of them, both looking at the cloud from each grasp's own frame."""
+"""Denoiser and discriminator of grasps; both express the cloud in each grasp's own frame."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-POSITION_SCALE_M = 0.05
+POSITION_SCALE_M = 0.05  # positions, points and widths get values near 1 in the training data
 CLOUD_SCALE_M = 0.06
 WIDTH_MEAN_M, WIDTH_SCALE_M = 0.055, 0.03
 N_COORDINATES = 10
 _N_TOKENS = 48
 _N_RELATIVE = 24
 _QUERY, _VALUE = 16, 24  # channels of an attention head
-_FIRST_TIME = 0.995
+_FIRST_TIME = 0.995  # at 1 the signal is zero and the step to the next time is not finite
 
 
 def encode_grasps(T: Tensor, widths_m: Tensor) -> Tensor:
@@ -26,7 +26,7 @@ def encode_grasps(T: Tensor, widths_m: Tensor) -> Tensor:
 
 
 def decode_grasps(v: Tensor) -> tuple[Tensor, Tensor]:
-    """Return poses (…, 4, 4) and widths (…) [m] of coordinates (…, 10), their axes made square to each other."""
+    """Return poses (…, 4, 4) and widths (…) [m] of coordinates (…, 10), their axes orthonormalised."""
     T = torch.zeros(*v.shape[:-1], 4, 4, dtype=v.dtype, device=v.device)
     T[..., :3, :3] = decode_rotations(v)
     T[..., :3, 3] = v[..., :3] * POSITION_SCALE_M
@@ -42,7 +42,7 @@ def decode_rotations(v: Tensor) -> Tensor:
     return torch.stack([torch.linalg.cross(y, z), y, z], dim=-1)
 
 
-def signal_share(t: Tensor) -> Tensor:
+def alpha_bar(t: Tensor) -> Tensor:
     """Return ᾱ(t), t in [0, 1], of the cosine schedule (Nichol and Dhariwal 2021, eq. 17)."""
     return torch.cos((t + 0.008) / 1.008 * math.pi / 2.0) ** 2
 
@@ -60,7 +60,7 @@ def _mlp(*sizes: int) -> nn.Sequential:
 
 
 class CloudEncoder(nn.Module):
-    """PointNet with one pass of global context; gives a code of the whole cloud and one of each token point."""
+    """PointNet with one pass of global context: a code of the whole cloud and one of each token point."""
 
     def __init__(self, code: int = 256, token: int = 128) -> None:
         super().__init__()
@@ -79,7 +79,7 @@ class CloudEncoder(nn.Module):
 
 
 class _Block(nn.Module):
-    """Attention from a grasp to the token points, biased by where they lie in its frame; then a modulated MLP."""
+    """Attention from a grasp to the token points, biased by their positions in its frame; then a modulated MLP."""
 
     def __init__(self, width: int, condition: int, token: int, heads: int = 4) -> None:
         super().__init__()
@@ -96,22 +96,22 @@ class _Block(nn.Module):
         nn.init.zeros_(self.out.weight)
 
     def forward(self, x: Tensor, condition: Tensor, tokens: Tensor, relative: Tensor) -> Tensor:
-        """Return x (B, K, width) after looking at tokens (B, M, ·) that lie at `relative` (B, K, M, 24)."""
+        """Return x (B, K, width) after attention to tokens (B, M, ·) with positions `relative` (B, K, M, 24)."""
         batch, count, _ = x.shape
         query = self.query(self.norm_query(x)).view(batch, count, self.heads, _QUERY).transpose(1, 2)
         key = self.key(tokens).view(batch, -1, self.heads, _QUERY).permute(0, 2, 3, 1)
         value = self.value(tokens).view(batch, -1, self.heads, _VALUE).transpose(1, 2)
         weights = query @ key / math.sqrt(_QUERY) + self.bias(relative).permute(0, 3, 1, 2)
         weights = weights.softmax(dim=-1)
-        seen = (weights @ value).transpose(1, 2)  # (B, K, H, 24)
-        felt = weights.transpose(1, 2) @ relative  # (B, K, H, M) @ (B, K, M, 24)
-        x = x + self.out(torch.cat([seen, felt], dim=-1).flatten(2))
+        content = (weights @ value).transpose(1, 2)  # (B, K, H, 24)
+        position = weights.transpose(1, 2) @ relative  # (B, K, H, M) @ (B, K, M, 24)
+        x = x + self.out(torch.cat([content, position], dim=-1).flatten(2))
         scale, shift = self.modulate(condition).chunk(2, dim=-1)
         return x + self.mlp(self.norm(x) * (1.0 + scale) + shift)
 
 
 class GraspHead(nn.Module):
-    """Maps grasps and a cloud to numbers about each grasp."""
+    """Network from grasps and a cloud to outputs for each grasp."""
 
     def __init__(self, outputs: int, blocks: int, timed: bool, width: int = 192) -> None:
         super().__init__()
@@ -124,9 +124,9 @@ class GraspHead(nn.Module):
 
     def forward(self, v: Tensor, t: Tensor | None, code: Tensor, tokens: Tensor, cloud: Tensor) -> Tensor:
         """Return (B, K, outputs) for grasps v (B, K, 10) at times t (B, K or 1) among clouds (B, N, 6)."""
-        with torch.autocast(v.device.type, enabled=False):  # a token of 5 cm and bfloat16 make 0.2 mm
-            seen = _seen_from(v.float(), cloud[:, :_N_TOKENS].float())
-        relative = self.relative(seen)
+        with torch.autocast(v.device.type, enabled=False):  # bfloat16 at 5 cm resolves 0.2 mm
+            local = _express_in_grasps(v.float(), cloud[:, :_N_TOKENS].float())
+        relative = self.relative(local)
         condition = code[:, None]
         if self.time is not None and t is not None:
             rates = torch.exp(torch.linspace(0.0, math.log(1000.0), 32, device=t.device))
@@ -140,23 +140,23 @@ class GraspHead(nn.Module):
         return self.leave(x)
 
 
-def _seen_from(v: Tensor, token_points: Tensor) -> Tensor:
-    """Return where (B, K, M, 12) token points (B, M, 6) and their normals lie in the frames of grasps (B, K, 10)."""
+def _express_in_grasps(v: Tensor, token_points: Tensor) -> Tensor:
+    """Return token points (B, M, 6) and their normals in the frames of grasps (B, K, 10), as features (B, K, M, 12)."""
     batch, count, _ = v.shape
     R = decode_rotations(v)
     columns = R.permute(0, 2, 1, 3).reshape(batch, 3, count * 3)
     m = token_points.shape[1]
 
-    def turned(vectors: Tensor) -> Tensor:
+    def rotate(vectors: Tensor) -> Tensor:
         return (vectors @ columns).view(batch, m, count, 3).transpose(1, 2)
 
     origin = v[:, :, None, :3] @ R  # (B, K, 1, 3)
-    r = turned(token_points[..., :3] / POSITION_SCALE_M) - origin
-    return torch.cat([r / 2.0, torch.tanh(1.5 * r), torch.tanh(5.0 * r), turned(token_points[..., 3:])], dim=-1)
+    r = rotate(token_points[..., :3] / POSITION_SCALE_M) - origin
+    return torch.cat([r / 2.0, torch.tanh(1.5 * r), torch.tanh(5.0 * r), rotate(token_points[..., 3:])], dim=-1)
 
 
 class Denoiser(nn.Module):
-    """The generator: learns v-prediction (Salimans and Ho 2022), samples by DPM-Solver++(2M) (Lu et al. 2022)."""
+    """Grasp generator: v-prediction (Salimans and Ho 2022), sampled by DPM-Solver++(2M) (Lu et al. 2022)."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -167,17 +167,17 @@ class Denoiser(nn.Module):
         """Return the mean squared error of the predicted velocity for grasps (B, K, 10) of clouds (B, N, 6)."""
         code, tokens = self.encoder(cloud)
         t = torch.rand(grasps.shape[:2], device=grasps.device) * 0.999 + 0.0005
-        share = signal_share(t)[..., None]
+        signal = alpha_bar(t)[..., None]
         noise = torch.randn_like(grasps)
-        noisy = share.sqrt() * grasps + (1.0 - share).sqrt() * noise
-        velocity = share.sqrt() * noise - (1.0 - share).sqrt() * grasps
+        noisy = signal.sqrt() * grasps + (1.0 - signal).sqrt() * noise
+        velocity = signal.sqrt() * noise - (1.0 - signal).sqrt() * grasps
         return F.mse_loss(self.head(noisy, t, code, tokens, cloud).float(), velocity)
 
     @torch.inference_mode()
     def sample(self, cloud: Tensor, noise: Tensor, steps: int) -> Tensor:
         """Return grasps (B, K, 10) of clouds (B, N, 6), denoised from `noise` (B, K, 10).
 
-        Each step leans on the one before it, which gives at 5 steps what first-order steps (DDIM) give at 8.
+        Each step uses the one before it, which reaches with 5 steps the quality of 8 first-order steps (DDIM).
         """
         code, tokens = self.encoder(cloud)
         x, before, stride_before = noise, None, 0.0
@@ -197,13 +197,13 @@ class Denoiser(nn.Module):
 
 
 def _signal_and_spread(time: Tensor) -> tuple[float, float]:
-    """Return how much of the grasp and how much of the noise there is at a time."""
-    share = float(signal_share(time.double()))
-    return math.sqrt(share), math.sqrt(1.0 - share)
+    """Return the weights of the grasp and of the noise at a time."""
+    signal = float(alpha_bar(time.double()))
+    return math.sqrt(signal), math.sqrt(1.0 - signal)
 
 
 class Discriminator(nn.Module):
-    """Judges grasps: the logit of the chance that one holds."""
+    """Scorer of grasps: the logit of the probability that a grasp holds."""
 
     def __init__(self) -> None:
         super().__init__()

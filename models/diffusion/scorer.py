@@ -1,29 +1,30 @@
-"""Scores by the learned discriminator for grasps that anybody proposed."""
+"""Scores by the learned discriminator for grasps of any generator."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from hal.base.transforms import inverse
 from models.diffusion.cloud import prepare_cloud
 from models.diffusion.sampler import DiffusionConfig
 from models.torch_threads import single_threaded_workers
 from models.types import GraspSet, check_object_cloud
 
-_PAD_HALF_WIDTH_M = 0.011  # of the hand that the weights were trained for
+_PAD_HALF_WIDTH_M = 0.011  # half the finger width of the gripper that the weights were trained for
 _PAD_REACH_M = 0.03
 _MIN_WIDTH_M = 0.002
-_UNSEEN_WIDTH_M = 0.055  # the mean of the training data
+_DEFAULT_WIDTH_M = 0.055  # the mean of the training data
 
 
 class GraspScorer:
-    """Judges grasps by the discriminator of a `DiffusionSampler`'s weights: the chance that each holds.
+    """Scorer by the discriminator of a `DiffusionSampler`'s weights: the probability that a grasp holds.
 
     It was trained on grasps whose fingertips reach 4 to 20 mm past the contacts, on clouds of one object, seen from
     their origin. Safe to call from several threads.
     """
 
     def __init__(self, config: DiffusionConfig | None = None) -> None:
-        """Load the weights that `config` names; of the rest of it only `threads` and `max_width_m` count.
+        """Load the weights that `config` names; of its other fields only `threads` and `max_width_m` are used.
 
         Raises:
             WeightsError: they are missing, damaged or of another network.
@@ -37,10 +38,10 @@ class GraspScorer:
     def score(self, points: np.ndarray, grasps: GraspSet, seed: int = 0) -> np.ndarray:
         """Return scores (N,) in [0, 1] of `grasps` on the object's `points` (M, 3) [m], in one frame with them.
 
-        Widths that nobody told are measured in the cloud. The seed draws the points that the network sees.
+        Missing widths are measured in the cloud. The seed draws the points of the network's input.
 
         Raises:
-            ValueError: no grasps; fewer than 30 points, points not finite, all in one place, or not in metres.
+            InvalidValueError: no grasps; fewer than 30 points, points not finite, all in one place, or not in metres.
         """
         import torch
 
@@ -48,30 +49,30 @@ class GraspScorer:
 
         points = check_object_cloud(points, len(grasps))
         cloud = prepare_cloud(points, np.random.default_rng(seed))
-        T_view_grasps = np.linalg.inv(cloud.T_camera_view) @ grasps.T_camera_grasps
+        T_view_grasps = inverse(cloud.T_camera_view) @ grasps.T_camera_grasps
         widths = np.array(grasps.widths_m)
-        untold = ~np.isfinite(widths)
-        widths[untold] = measure_widths(cloud.points, T_view_grasps[untold])
+        missing = ~np.isfinite(widths)
+        widths[missing] = measure_widths(cloud.points, T_view_grasps[missing])
         encoded = encode_grasps(
             torch.from_numpy(T_view_grasps), torch.from_numpy(np.clip(widths, _MIN_WIDTH_M, self.config.max_width_m))
         ).float()
-        seen = torch.from_numpy(np.concatenate([cloud.points, cloud.normals], axis=1).astype(np.float32))[None]
+        features = torch.from_numpy(np.concatenate([cloud.points, cloud.normals], axis=1).astype(np.float32))[None]
 
-        def judge(part: torch.Tensor) -> np.ndarray:
+        def score_part(part: torch.Tensor) -> np.ndarray:
             with torch.inference_mode():
-                return torch.sigmoid(self._discriminator(seen, part[None]))[0].double().numpy()
+                return torch.sigmoid(self._discriminator(features, part[None]))[0].double().numpy()
 
         parts = torch.tensor_split(encoded, min(self.config.threads, len(encoded)))
-        return np.concatenate(list(self._workers.map(judge, parts)))
+        return np.concatenate(list(self._workers.map(score_part, parts)))
 
 
 def measure_widths(points: np.ndarray, T: np.ndarray) -> np.ndarray:
-    """Return how wide (N,) the object is between the pads of grasps `T` (N, 4, 4) [m], as far as `points` (M, 3) show.
+    """Return widths (N,) of the object between the pads of grasps `T` (N, 4, 4) [m], from its `points` (M, 3).
 
-    The pads close on the middle, so the side that is seen tells of both. Where there is no point between the pads
-    the width is a usual one.
+    The pads close on the middle, so one visible side gives the width. Without a point between the pads it is the mean
+    width of the training data.
     """
-    widths = np.full(len(T), _UNSEEN_WIDTH_M)
+    widths = np.full(len(T), _DEFAULT_WIDTH_M)
     for index, pose in enumerate(T):
         x, y, z = ((points - pose[:3, 3]) @ pose[:3, :3]).T
         between = (np.abs(x) < _PAD_HALF_WIDTH_M) & (z < 0.0) & (z > -_PAD_REACH_M)

@@ -1,9 +1,9 @@
-"""What adapters raise when it is not the cloud that is wrong."""
+"""Errors of the generator adapters that are not about the cloud."""
 
 from hal.base.errors import Z1Error
 
 
 class GeneratorError(Z1Error, RuntimeError):
-    """A generator that cannot be made or did not answer: a package, a checkpoint or a process is at fault."""
+    """Generator that cannot be made or does not answer, because of a package, a checkpoint or a process."""
 
     default_code = "generator"

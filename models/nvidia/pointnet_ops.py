@@ -1,7 +1,7 @@
 """The four operations of PointNet++ in plain PyTorch, for networks whose own are compiled for CUDA.
 
-Written from their description (Qi et al. 2017) and from what the compiled ones do at the edges, so that released
-weights see what they were trained on.
+Written from their description (Qi et al. 2017) and from the edge cases of the compiled ones, so that released weights
+get the inputs that they were trained on.
 """
 
 from __future__ import annotations
@@ -9,14 +9,14 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-_AT_ORIGIN_SQUARED = 1e-3  # the compiled sampling never draws a point this near to the origin, which pads short clouds
+_AT_ORIGIN_SQUARED = 1e-3  # the compiled sampling skips points this near to the origin, which pad short clouds
 
 
 def furthest_point_sampling(points: Tensor, count: int) -> Tensor:
     """Return indices (B, count) int32 of points (B, N, 3), each the furthest from those before; the first is point 0.
 
-    Points within about 32 mm of the origin are passed over, as the compiled operation does; where no other is left,
-    point 0 is repeated.
+    Points within about 32 mm of the origin are skipped, as in the compiled operation; without any other, point 0 is
+    repeated.
     """
     batch = torch.arange(len(points), device=points.device)
     near_origin = points.square().sum(dim=-1) <= _AT_ORIGIN_SQUARED

@@ -1,4 +1,4 @@
-"""A generator that runs in its own process, with a Python whose packages are its own business."""
+"""Generator in a process of its own, with a Python environment of its own."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ import numpy as np
 
 from hal.base.errors import InvalidValueError
 from models.nvidia.errors import GeneratorError
-from models.nvidia.wire import PROTOCOL, PipeError, read_message, write_message
+from models.nvidia.pipe import PROTOCOL, PipeError, read_message, write_message
 from models.types import GraspSet, check_object_cloud
 
 WORKER = Path(__file__).with_name("worker.py")
-_ENDING_S = 2.0
-_LAST_LINES = 12
+_EXIT_TIMEOUT_S = 2.0  # then the process is killed
+_STDERR_LINES = 12  # enough for the end of a traceback
 
-_Answer = dict[str, np.ndarray] | PipeError | None
+_Reply = dict[str, np.ndarray] | PipeError | None
 
 
 class ProcessGenerator:
-    """A `GraspGenerator` that asks a process of its own.
+    """A `GraspGenerator` that runs in a process of its own.
 
-    The process starts with the generator, and anew at the first request after it died or was too slow. It ends when
-    `close` is called, when nobody holds the generator any more, or when this process ends, however it does.
+    The process starts with the generator, and again at the first request after it died or timed out. It ends at
+    `close`, when the generator is garbage collected, or when this process ends in any way.
     """
 
     def __init__(
@@ -42,18 +42,18 @@ class ProcessGenerator:
         start_timeout_s: float = 300.0,
         timeout_s: float = 60.0,
     ) -> None:
-        """Start it and wait until it has loaded its networks.
+        """Start the process and wait until it has loaded its networks.
 
         Args:
             name: `graspgen` or `graspgenx`.
             checkpoint: the file or folder of its weights.
-            python: the interpreter that has its package.
-            worker: what that runs.
-            start_timeout_s: how long loading may take [s].
-            timeout_s: how long an answer may take [s].
+            python: interpreter with the generator's package.
+            worker: script of the process.
+            start_timeout_s: timeout of loading [s].
+            timeout_s: timeout of a reply [s].
 
         Raises:
-            GeneratorError: it does not start, or its package or checkpoint is at fault.
+            GeneratorError: the process does not start, or its package or checkpoint cannot be used.
         """
         self._name, self._command = name, [str(python), "-I", str(worker), name, str(checkpoint)]
         self._start_timeout_s, self._timeout_s = start_timeout_s, timeout_s
@@ -61,36 +61,33 @@ class ProcessGenerator:
         self._child: _Child | None = self._start()
 
     def sample(self, points: np.ndarray, n: int, seed: int) -> GraspSet:
-        """Return `n` grasps for `points` (M, 3) [m], best score first, as the generator in the process does.
+        """Return `n` grasps for `points` (M, 3) [m], best score first, from the generator in the process.
 
         Raises:
-            ValueError: the cloud is at fault.
-            GeneratorError: the process died, gave no answer in time, or an answer that is none.
+            InvalidValueError: the cloud cannot be used.
+            GeneratorError: the process died, timed out, or sent an invalid reply.
         """
         points = check_object_cloud(points, n)
         with self._lock:
             if self._child is None:
                 self._child = self._start()
-            answer = self._ask(self._child, {"points": points, "n": n, "seed": seed}, self._timeout_s)
-        if "error" in answer:
-            message, kind = str(answer["error"]), str(answer["kind"])
-            raise (
-                InvalidValueError(message)
-                if kind == "ValueError"
-                else GeneratorError(f"{self._name}: {kind}: {message}")
-            )
+            reply = self._request(self._child, {"points": points, "n": n, "seed": seed}, self._timeout_s)
+        if "error" in reply:
+            raise self._error_of(reply)
         try:
             return GraspSet(
-                T_camera_grasps=answer["T_camera_grasps"],
-                scores=answer["scores"],
-                widths_m=answer["widths_m"],
-                source=str(answer["source"]),
+                T_camera_grasps=reply["T_camera_grasps"],
+                scores=reply["scores"],
+                widths_m=reply["widths_m"],
+                source=str(reply["source"]),
             )
         except (KeyError, ValueError) as err:
-            raise GeneratorError(f"the process of {self._name} gave an answer that is no grasps: {err}") from err
+            raise GeneratorError(
+                f"the process of {self._name} sent a reply without grasps: {err}", code="bad_output"
+            ) from err
 
     def close(self) -> None:
-        """End the process; a later request would start it anew."""
+        """End the process; a later request starts it again."""
         with self._lock:
             if self._child is not None:
                 self._child.end()
@@ -98,32 +95,42 @@ class ProcessGenerator:
 
     def _start(self) -> _Child:
         child = _Child(self._command)
-        hello = self._ask(child, None, self._start_timeout_s)
+        hello = self._request(child, None, self._start_timeout_s)
         if "error" in hello:
             child.end()
-            raise GeneratorError(str(hello["error"]))
-        seen = int(hello.get("protocol", np.array(-1)))
-        if seen != PROTOCOL:
+            raise GeneratorError(str(hello["error"]), code=str(hello["code"]))
+        received = int(hello.get("protocol", np.array(-1)))
+        if received != PROTOCOL:
             child.end()
-            raise GeneratorError(f"the process of {self._name} speaks version {seen}; allowed is {PROTOCOL}.")
+            raise GeneratorError(
+                f"the process of {self._name} has protocol version {received}; allowed is {PROTOCOL}.",
+                code="protocol_version",
+            )
         return child
 
-    def _ask(
+    def _error_of(self, reply: dict[str, np.ndarray]) -> InvalidValueError | GeneratorError:
+        """Return the error of a reply: about the cloud, or about the generator."""
+        message, kind, code = (str(reply[key]) for key in ("error", "kind", "code"))
+        if kind == "ValueError":
+            return InvalidValueError(message, code=code)
+        return GeneratorError(f"{self._name}: {kind}: {message}", code=code)
+
+    def _request(
         self, child: _Child, request: dict[str, np.ndarray | int] | None, timeout_s: float
     ) -> dict[str, np.ndarray]:
-        """Return the answer to `request`, or to nothing the first; a child that fails is ended and forgotten."""
+        """Return the reply to `request`, or the first message for None; a child that fails is ended and dropped."""
         try:
-            return child.ask(request, timeout_s)
-        except BaseException as err:  # also Ctrl-C: what was asked would be taken for the next answer
+            return child.request(request, timeout_s)
+        except BaseException as err:  # also Ctrl-C: a late reply would be taken for the next one
             self._child = None
             child.end()
             if not isinstance(err, GeneratorError):
                 raise
-            raise GeneratorError(f"the process of {self._name} {err}{child.last_words()}") from err
+            raise GeneratorError(f"the process of {self._name} {err}{child.stderr_tail()}", code=err.code) from err
 
 
 class _Child:
-    """The process, with what it answers in a queue and what it says last."""
+    """Child process, with its replies in a queue and the last lines of its stderr."""
 
     def __init__(self, command: list[str]) -> None:
         try:
@@ -131,69 +138,69 @@ class _Child:
                 command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE
             )
         except OSError as err:
-            raise GeneratorError(f"{command[0]} cannot be started: {err.strerror}.") from err
+            raise GeneratorError(f"{command[0]} cannot be started: {err.strerror}.", code="process_start") from err
         assert self._process.stdin and self._process.stdout and self._process.stderr
         self._requests = cast(BinaryIO, self._process.stdin)
-        self._answers: SimpleQueue[_Answer] = SimpleQueue()
-        self._said: deque[str] = deque(maxlen=_LAST_LINES)
+        self._replies: SimpleQueue[_Reply] = SimpleQueue()
+        self._stderr_lines: deque[str] = deque(maxlen=_STDERR_LINES)
         self._threads = [
-            threading.Thread(target=_read_answers, args=(self._process.stdout, self._answers), daemon=True),
-            threading.Thread(target=_read_words, args=(self._process.stderr, self._said), daemon=True),
+            threading.Thread(target=_read_replies, args=(self._process.stdout, self._replies), daemon=True),
+            threading.Thread(target=_read_stderr, args=(self._process.stderr, self._stderr_lines), daemon=True),
         ]
         for thread in self._threads:
             thread.start()
         weakref.finalize(self, _end, self._process)
 
-    def ask(self, request: dict[str, np.ndarray | int] | None, timeout_s: float) -> dict[str, np.ndarray]:
-        """Send `request`, unless None, and return what comes.
+    def request(self, request: dict[str, np.ndarray | int] | None, timeout_s: float) -> dict[str, np.ndarray]:
+        """Send `request`, unless None, and return the next message.
 
         Raises:
-            GeneratorError: nothing, or nothing useful; the message goes on "the process of …".
+            GeneratorError: no message, or an invalid one; the text continues "the process of …".
         """
         try:
             if request is not None:
                 write_message(self._requests, request)
-            answer = self._answers.get(timeout=timeout_s)
+            reply = self._replies.get(timeout=timeout_s)
         except Empty:
-            raise GeneratorError(f"gave no answer in {timeout_s:g} s and was ended.") from None
+            raise GeneratorError(f"sent no reply in {timeout_s:g} s and was ended.", code="process_timeout") from None
         except OSError:
-            answer = None
-        if isinstance(answer, PipeError):
-            raise GeneratorError(f"gave no proper answer: {answer}")
-        if answer is None:
+            reply = None
+        if isinstance(reply, PipeError):
+            raise GeneratorError(f"sent an invalid reply: {reply}", code=reply.code)
+        if reply is None:
             _end(self._process)
-            raise GeneratorError(f"ended with code {self._process.returncode}.")
-        return answer
+            raise GeneratorError(f"ended with code {self._process.returncode}.", code="process_ended")
+        return reply
 
-    def last_words(self) -> str:
-        """Return what it said last, each line indented, after it has ended."""
-        self._threads[1].join(_ENDING_S)
-        return "".join(f"\n    {line}" for line in self._said)
+    def stderr_tail(self) -> str:
+        """Return the last lines of its stderr, indented, after it has ended."""
+        self._threads[1].join(_EXIT_TIMEOUT_S)
+        return "".join(f"\n    {line}" for line in self._stderr_lines)
 
     def end(self) -> None:
-        """End it; it is gone when this returns."""
+        """End the process and wait for its exit."""
         _end(self._process)
 
 
 def _end(process: subprocess.Popen) -> None:
-    with suppress(OSError):  # it has gone with a request half read
+    with suppress(OSError):  # it may have exited within a request
         process.stdin.close()  # type: ignore[union-attr]
     try:
-        process.wait(_ENDING_S)
+        process.wait(_EXIT_TIMEOUT_S)
     except subprocess.TimeoutExpired:
         process.kill()
         process.wait()
 
 
-def _read_answers(stream: BinaryIO, answers: SimpleQueue[_Answer]) -> None:
+def _read_replies(stream: BinaryIO, replies: SimpleQueue[_Reply]) -> None:
     try:
         while (message := read_message(stream)) is not None:
-            answers.put(message)
-        answers.put(None)
+            replies.put(message)
+        replies.put(None)
     except PipeError as err:
-        answers.put(err)
+        replies.put(err)
 
 
-def _read_words(stream: BinaryIO, said: deque[str]) -> None:
+def _read_stderr(stream: BinaryIO, lines: deque[str]) -> None:
     for line in stream:
-        said.append(line.decode(errors="replace").rstrip())
+        lines.append(line.decode(errors="replace").rstrip())

@@ -1,4 +1,4 @@
-"""Lets networks written for CUDA run where there is none, without a change to their source."""
+"""Patches that let networks written for CUDA run without it, with their source unchanged."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ _PATCHING = threading.RLock()
 
 
 @contextmanager
-def cuda_only_if_there() -> Iterator[None]:
-    """Within, `.cuda()` of tensors and networks leaves them where they are, if this machine has no CUDA.
+def cuda_if_available() -> Iterator[None]:
+    """Turn `.cuda()` of tensors and networks into a no-operation within, if this machine has no CUDA.
 
-    Elsewhere in the process such a call would only have raised, so nobody else is led astray.
+    Elsewhere in the process such a call could only raise, so no other code changes its behaviour.
     """
     if torch.cuda.is_available():
         yield
@@ -31,7 +31,7 @@ def cuda_only_if_there() -> Iterator[None]:
         owners: tuple[Any, ...] = (Tensor, nn.Module)
         kept = [owner.cuda for owner in owners]
         for owner in owners:
-            owner.cuda = _stay
+            owner.cuda = _keep_device
         try:
             yield
         finally:
@@ -39,13 +39,13 @@ def cuda_only_if_there() -> Iterator[None]:
                 owner.cuda = method
 
 
-def _stay(self: Any, *_: Any, **__: Any) -> Any:
+def _keep_device(self: Any, *_: Any, **__: Any) -> Any:
     return self
 
 
 @contextmanager
-def drawn_from(seed: int) -> Iterator[None]:
-    """Within, the global random numbers of torch and NumPy begin at `seed`; afterwards they go on as before."""
+def seed_random_numbers(seed: int) -> Iterator[None]:
+    """Seed the global random numbers of torch and NumPy within; afterwards they continue as before."""
     state = np.random.get_state()
     try:
         with torch.random.fork_rng():
@@ -57,12 +57,12 @@ def drawn_from(seed: int) -> Iterator[None]:
 
 
 @contextmanager
-def compiled_ops_replaced() -> Iterator[None]:
-    """Within, importing the package `pointnet2_ops` gives our operations; it is not compiled and need not be there."""
-    stand_in: Any = ModuleType("pointnet2_ops")
-    stand_in._ext = pointnet_ops
+def replace_compiled_ops() -> Iterator[None]:
+    """Replace the package `pointnet2_ops` by our operations within; it is neither compiled nor required."""
+    replacement: Any = ModuleType("pointnet2_ops")
+    replacement._ext = pointnet_ops
     before = sys.modules.get("pointnet2_ops")
-    sys.modules["pointnet2_ops"] = stand_in
+    sys.modules["pointnet2_ops"] = replacement
     try:
         yield
     finally:
@@ -73,7 +73,7 @@ def compiled_ops_replaced() -> Iterator[None]:
 
 
 class _FoldedAttention(nn.Module):
-    """Attention over a sequence of one: its softmax is 1, so what comes out is a linear map of the value."""
+    """Attention over a sequence of one: its softmax is 1, so its output is a linear map of the value."""
 
     def __init__(self, attention: nn.MultiheadAttention) -> None:
         super().__init__()
@@ -95,9 +95,9 @@ class _FoldedAttention(nn.Module):
 
 
 def fold_attention(network: nn.Module) -> int:
-    """Replace every attention in `network`, which only ever sees one token, by its linear map; return how many.
+    """Replace every attention in `network`, which always gets one token, by its linear map; return their number.
 
-    The result is the same but for rounding. Three times fewer numbers are read, which is what it waits for on a CPU.
+    The result is the same but for rounding. A third of the weights is read, and memory is the limit on a CPU.
     """
     folded = 0
     for parent in list(network.modules()):

@@ -1,7 +1,7 @@
-"""A generator in a process and a Python of its own: `python -I worker.py graspgen CHECKPOINT`.
+"""Generator in a process and a Python of its own: `python -I worker.py graspgen CHECKPOINT`.
 
-Run as a file, in an environment that has NumPy and the generator's package and need not have ours: of this project
-only `models` and `hal` are made importable, from where this file lies. Answers on stdout until stdin ends.
+It runs as a file, in an environment with NumPy and the generator's package, without this project's dependencies: only
+`models` and `hal.base.errors` become importable, from this file's folder. It replies on stdout until stdin ends.
 """
 
 from __future__ import annotations
@@ -17,35 +17,35 @@ _OLDEST = (3, 11)
 
 
 def main(name: str, checkpoint: str) -> int:
-    """Load the generator called `name`, say so, and answer requests; 0 when stdin ends."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the process that asks; its end ends this one
-    answers = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # whatever the generator prints shall not be taken for an answer
-    _import_rooms()
-    from models.nvidia.nvidia import load_here
-    from models.nvidia.wire import PROTOCOL, write_message
+    """Load the generator called `name`, report it, and serve requests; return 0 when stdin ends."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent process, whose end ends this one
+    replies = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)  # prints of the generator must not mix with the replies
+    _import_packages()
+    from models.nvidia.nvidia import load_in_process
+    from models.nvidia.pipe import PROTOCOL, write_message
 
     try:
-        generator = load_here(name, Path(checkpoint))
-    except Exception as err:
-        write_message(answers, {"error": str(err), "kind": type(err).__name__})
+        generator = load_in_process(name, Path(checkpoint))
+    except Exception as err:  # every failure has to reach the parent process
+        write_message(replies, _describe(err))
         return 1
-    write_message(answers, {"protocol": PROTOCOL, "python": sys.version.split()[0]})
-    _serve(generator, answers)
+    write_message(replies, {"protocol": PROTOCOL, "python": sys.version.split()[0]})
+    _serve(generator, replies)
     return 0
 
 
-def _serve(generator, answers) -> None:
-    from models.nvidia.wire import read_message, write_message
+def _serve(generator, replies) -> None:
+    from models.nvidia.pipe import read_message, write_message
 
     while (request := read_message(sys.stdin.buffer)) is not None:
         try:
             grasps = generator.sample(request["points"], int(request["n"]), int(request["seed"]))
-        except Exception as err:
-            write_message(answers, {"error": str(err), "kind": type(err).__name__})
+        except Exception as err:  # as above
+            write_message(replies, _describe(err))
         else:
             write_message(
-                answers,
+                replies,
                 {
                     "T_camera_grasps": grasps.T_camera_grasps,
                     "scores": grasps.scores,
@@ -55,15 +55,21 @@ def _serve(generator, answers) -> None:
             )
 
 
-def _import_rooms() -> None:
-    """Make `models`, and `hal` for its errors, importable: our packages must not stand in for those of this Python."""
-    for room in ("models", "hal"):
-        folder = _ROOT / room
+def _describe(err: Exception) -> dict[str, str]:
+    """Return an error as a message: text, kind (`ValueError` for the cloud's) and code."""
+    kind = "ValueError" if isinstance(err, ValueError) else type(err).__name__
+    return {"error": str(err), "kind": kind, "code": getattr(err, "code", "generator")}
+
+
+def _import_packages() -> None:
+    """Make `models`, and `hal` for its errors, importable without a path that would shadow this Python's packages."""
+    for package in ("models", "hal"):
+        folder = _ROOT / package
         spec = importlib.util.spec_from_file_location(
-            room, folder / "__init__.py", submodule_search_locations=[str(folder)]
+            package, folder / "__init__.py", submodule_search_locations=[str(folder)]
         )
         assert spec is not None and spec.loader is not None
-        sys.modules[room] = module = importlib.util.module_from_spec(spec)
+        sys.modules[package] = module = importlib.util.module_from_spec(spec)
         spec.loader.exec_module(module)
 
 

@@ -6,13 +6,13 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 _YAW_BINS = 90  # Zhang et al. 2017 search the quarter turn in steps of 1°
-_CLOSENESS_D0_M = 1.5e-3  # about two sigma of the camera's depth noise: nearer than this counts as on the edge
-_COARSE_CELL_M = 5e-3
-_FINE_CELL_M = 2e-3
-_MAX_CELLS_A_SIDE = 500
+_CLOSENESS_D0_M = 1.5e-3  # about two sigma of the camera's depth noise: nearer points count as on the edge
+_COARSE_CELL_M = 5e-3  # for the search over the whole quarter turn
+_FINE_CELL_M = 2e-3  # for its refinement to 0.125°
+_MAX_CELLS_PER_SIDE = 500
 _ROUND_CONTRAST = 0.7  # median over best closeness: ≤ 0.63 on boxes, ≥ 0.76 on cylinders of 40–84 mm and a bottle
 _PLATEAU = 0.99
-_PLANAR_M = 1e-4
+_PLANAR_M = 1e-4  # thinner clouds have no hull in three dimensions that Qhull can build
 _MAX_HULL_DIRECTIONS = 48
 
 
@@ -24,14 +24,14 @@ def principal_axes(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def min_volume_axes(points: np.ndarray, axes: np.ndarray) -> np.ndarray:
-    """Return the axes (3, 3) of a box of least volume with a face flush with the convex hull of `points` (N, 3).
+    """Return the axes (3, 3) of a minimum-volume box with a face flush with the convex hull of `points` (N, 3).
 
     The largest facets of the hull are tried as a face, the rectangle in each found by rotating calipers
-    (the least-area rectangle has a side on an edge of the hull); the best is polished about its other axes.
+    (the minimum-area rectangle has a side on an edge of the hull); the best is refined about its other axes.
 
     Args:
         points: (N, 3) [m].
-        axes: (3, 3) the principal axes of `points`; of a planar cloud the last is the box's.
+        axes: (3, 3) the principal axes of `points`; for a planar cloud the last is the box's normal.
     """
     if np.ptp(points @ axes[:, 2]) < _PLANAR_M:
         return _turn_by_calipers(points, axes[:, 2])[0]
@@ -52,9 +52,9 @@ def upright_axes(points: np.ndarray, up: np.ndarray) -> np.ndarray:
     """Return axes (3, 3) with z along `up` and the yaw of the L-shape closeness fit to the footprint of `points`.
 
     Zhang et al. 2017, "Efficient L-Shape Fitting for Vehicle Detection Using Laser Scanners", algorithm 4: the
-    yaw whose rectangle has most points close to its two occupied sides. A rectangle of least area lies along the
-    hypotenuse of the L that two visible side faces make; this one lies along the faces. A round footprint fits no yaw
-    better than another: its box faces the camera.
+    yaw whose rectangle has most points close to its two occupied sides. A minimum-area rectangle follows the
+    hypotenuse of the L that two visible side faces make; this one follows the faces. A round footprint prefers no
+    yaw: its box faces the camera.
 
     Args:
         points: (N, 3) [m].
@@ -83,7 +83,7 @@ def _closeness(footprint: np.ndarray, weights: np.ndarray, yaws_rad: np.ndarray)
     distances = []
     for direction in (np.stack([c, s]), np.stack([-s, c])):  # (2, K) each
         along = direction.T @ footprint  # (K, M)
-        # Percentile bounds, not extremes: one flying pixel must not carry a side away.
+        # Percentile bounds, not extremes: one flying pixel must not shift a side.
         ends = _row_percentiles(along, (1.0, 99.0))
         to_low, to_high = np.abs(along - ends[0][:, None]), np.abs(ends[1][:, None] - along)
         low_is_occupied = (to_low @ weights <= to_high @ weights)[:, None]
@@ -102,7 +102,7 @@ def _cell_means(flat: np.ndarray, weights: np.ndarray, cell_m: float) -> tuple[n
     """Merge points (2, N) that share a cell: mean positions (2, M) and summed weights (M,), in any order of points."""
     low = flat.min(axis=1, keepdims=True)
     span = (flat.max(axis=1, keepdims=True) - low).ravel()
-    cell_m = max(cell_m, float(span.max()) / _MAX_CELLS_A_SIDE)
+    cell_m = max(cell_m, float(span.max()) / _MAX_CELLS_PER_SIDE)
     columns, rows = ((flat - low) / cell_m).astype(np.int64)
     keys = columns * (int(span[1] / cell_m) + 2) + rows
     sums = np.bincount(keys, weights)
@@ -119,7 +119,7 @@ def _large_facet_normals(points: np.ndarray, hull: ConvexHull) -> np.ndarray:
 
 
 def _turn_by_calipers(points: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return axes (3, 3) with z along `normal` and the least-area rectangle across it, and the box's volume."""
+    """Return axes (3, 3) with z along `normal` and the minimum-area rectangle across it, and the box's volume."""
     frame = _frame_with_z(normal)
     flat = points @ frame[:, :2]
     rim = flat[ConvexHull(flat).vertices]

@@ -1,4 +1,4 @@
-"""An oriented box around a cloud seen by one camera, which stands at the origin of the points' frame."""
+"""Oriented box around a cloud seen by one camera at the origin of the points' frame."""
 
 from __future__ import annotations
 
@@ -15,27 +15,27 @@ FACE_SIGNS = np.array([1.0, -1.0, 1.0, -1.0, 1.0, -1.0])
 
 
 class DegenerateCloudError(Z1Error, ValueError):
-    """The points span no box: too few, on one line, all in one place, or not finite."""
+    """Cloud that spans no box: too few points, on one line, all in one place, or not finite."""
 
     default_code = "degenerate_cloud"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class OrientedBox:
-    """A right-handed box; faces are ordered +x, −x, +y, −y, +z, −z."""
+    """Right-handed oriented box; faces are ordered +x, −x, +y, −y, +z, −z."""
 
     T_camera_box: np.ndarray
     """(4, 4) pose of the box's centre; the columns of its rotation are the box's axes."""
     half_extents_m: np.ndarray
     """(3,) half the edge lengths along those axes [m]."""
     unobserved: np.ndarray
-    """(3,) bool, true for the axis along the view when only the face across it was seen: that extent is then
-    what the camera happened to see (noise on a flat face, half the depth of a round one), not the object's."""
+    """(3,) bool, true for the axis along the view when only the face across it is visible: that extent is then
+    the visible depth (noise on a flat face, half the depth of a round one), not the object's."""
 
     def __post_init__(self) -> None:
         shapes = (self.T_camera_box.shape, self.half_extents_m.shape, self.unobserved.shape)
         if shapes != ((4, 4), (3,), (3,)):
-            raise InvalidValueError(f"OrientedBox wants (4, 4), (3,), (3,); got {shapes}.")
+            raise InvalidValueError(f"OrientedBox takes (4, 4), (3,), (3,); got {shapes}.", code="shape")
         for array in (self.T_camera_box, self.half_extents_m, self.unobserved):
             array.setflags(write=False)
 
@@ -66,7 +66,7 @@ class OrientedBox:
 
     @property
     def face_centers_m(self) -> np.ndarray:
-        """(6, 3) true centres of the faces in the camera frame: half an edge from the box's centre [m]."""
+        """(6, 3) centres of the faces in the camera frame, half an edge from the box's centre [m]."""
         return self.center_m + self.face_normals * self.half_extents_m[FACE_AXES, None]
 
     @property

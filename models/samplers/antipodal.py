@@ -1,4 +1,4 @@
-"""Antipodal grasps from the visible front of an object, for any parallel jaw and from any side."""
+"""Antipodal grasps from the visible front of an object, for any parallel gripper and from any side."""
 
 from __future__ import annotations
 
@@ -8,21 +8,21 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from hal.base.errors import InvalidValueError
-from models.samplers.gripper_models import choose_hands, count_points
-from models.samplers.surfels import Surfels, estimate_normals, find_outline, guess_hidden_sides, smooth_normals
+from models.samplers.gripper_models import choose_candidates, count_points
+from models.samplers.surfels import Surfels, estimate_normals, estimate_occluded_sides, find_outline, smooth_normals
 from models.types import GraspSet, check_request
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AntipodalConfig:
-    """A generic parallel jaw, and how finely the cloud is looked at."""
+    """Generic parallel gripper, and the density of the search."""
 
     max_width_m: float = 0.085
     """Widest opening [m]."""
     min_width_m: float = 0.004
-    """Narrowest object worth closing on [m]."""
+    """Narrowest object to close on [m]."""
     clearance_m: float = 0.005
-    """How far each open finger stands off its contact [m]."""
+    """Distance of each open finger from its contact [m]."""
     finger_length_m: float = 0.05
     """From the palm to the fingertips [m]."""
     finger_thickness_m: float = 0.012
@@ -30,39 +30,44 @@ class AntipodalConfig:
     finger_width_m: float = 0.02
     """Of one finger, across the opening [m]."""
     min_depth_m: float = 0.004
-    """Least reach of the fingertips past the contacts [m]."""
+    """Minimum reach of the fingertips past the contacts [m]."""
     max_depth_m: float = 0.02
-    """Greatest reach of the fingertips past the contacts [m]."""
+    """Maximum reach of the fingertips past the contacts [m]."""
     edge_setback_m: float = 0.008
-    """How far behind a visible edge the pads touch a hidden side [m]."""
+    """Distance behind a visible edge at which the pads touch an occluded side [m]."""
     cone_rad: float = 0.26
-    """Greatest angle between the closing line and a contact's normal [rad]; inside a friction cone of 0.5."""
+    """Maximum angle between the closing line and a contact's normal [rad]; inside a friction cone of μ = 0.5."""
     n_surfels: int = 700
     """Visible points tried as contacts."""
-    n_hidden: int = 300
+    n_occluded: int = 300
     """Outline points tried as contacts."""
     n_collision_points: int = 700
-    """Points of the cloud against which hands are tested."""
+    """Points of the cloud against which candidates are tested."""
     oversampling: float = 2.5
-    """Hands tested for each grasp returned."""
+    """Candidates tested for each grasp returned."""
 
     def __post_init__(self) -> None:
         if not 0.0 < self.min_width_m < self.max_width_m:
-            raise InvalidValueError(f"Want 0 < min_width_m < max_width_m; got {self.min_width_m}, {self.max_width_m}.")
+            raise InvalidValueError(
+                f"antipodal: needs 0 < min_width_m < max_width_m; got {self.min_width_m}, {self.max_width_m}.",
+                code="gripper_width",
+            )
         if not 0.0 <= self.min_depth_m <= self.max_depth_m < self.finger_length_m:
             raise InvalidValueError(
-                f"Want 0 ≤ min_depth_m ≤ max_depth_m < finger_length_m; got {self.min_depth_m}, "
-                f"{self.max_depth_m}, {self.finger_length_m}."
+                f"antipodal: needs 0 ≤ min_depth_m ≤ max_depth_m < finger_length_m; got {self.min_depth_m}, "
+                f"{self.max_depth_m}, {self.finger_length_m}.",
+                code="gripper_depth",
             )
         if not 0.0 < self.cone_rad < np.pi / 2 or self.oversampling < 1.0:
             raise InvalidValueError(
-                f"Want 0 < cone_rad < π/2, oversampling ≥ 1; got {self.cone_rad}, {self.oversampling}."
+                f"antipodal: needs 0 < cone_rad < π/2, oversampling ≥ 1; got {self.cone_rad}, {self.oversampling}.",
+                code="sampling",
             )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Hands:
-    """Hypotheses: a closing line, an approach about it, and what the cloud says of both."""
+class _Candidates:
+    """Grasp hypotheses: a closing line, an approach about it, and the quality of the contacts."""
 
     centers: np.ndarray  # (H, 3) middle between the contacts
     closing: np.ndarray  # (H, 3) unit, from one contact to the other
@@ -75,9 +80,9 @@ class _Hands:
 class AntipodalSampler:
     """A `GraspGenerator` without learning: pairs contacts whose normals face each other along the line between them.
 
-    One camera sees no two opposite sides of an object, so the far contacts are guessed from its outline
-    (see `models/samplers/surfels.py`). Hands are turned evenly about each closing line; those whose fingers or palm
-    would hit the visible points come last. It knows neither arm, table nor gravity.
+    One camera sees no two opposite sides of an object, so the far contacts are estimated from its outline
+    (see `models/samplers/surfels.py`). Approaches are spread evenly about each closing line; candidates whose fingers
+    or palm would hit visible points come last. Arm, table and gravity are not considered.
     """
 
     def __init__(self, config: AntipodalConfig | None = None) -> None:
@@ -87,79 +92,86 @@ class AntipodalSampler:
         """Return `n` grasps for `points` (M, 3) [m] seen from their origin, best score first.
 
         Raises:
-            ValueError: fewer than 30 points, points not finite or all on one line, or no two of them can be
+            InvalidValueError: fewer than 30 points, points not finite or all on one line, or no two of them can be
                 touched from opposite sides within the opening.
         """
         points = check_request(points, n)
         rng = np.random.default_rng(seed)
         surfels = self._find_surfels(points, rng)
-        hands = self._draw_hands(surfels, points, int(np.ceil(n * self.config.oversampling)), rng)
+        candidates = self._draw_candidates(surfels, points, int(np.ceil(n * self.config.oversampling)), rng)
         cloud = points[rng.permutation(len(points))[: self.config.n_collision_points]]
-        T = _poses(hands)
-        hits, held = count_points(T, hands.widths, cloud, self.config)
-        scores = self._score(hands, hits, held, points)
-        chosen = choose_hands(scores, hits, n, rng)
+        T = _make_poses(candidates)
+        hits, held = count_points(T, candidates.widths, cloud, self.config)
+        scores = self._score(candidates, hits, held, points)
+        chosen = choose_candidates(scores, hits, n, rng)
         return GraspSet(
-            T_camera_grasps=T[chosen], scores=scores[chosen], widths_m=hands.widths[chosen], source="antipodal"
+            T_camera_grasps=T[chosen], scores=scores[chosen], widths_m=candidates.widths[chosen], source="antipodal"
         )
 
     def _find_surfels(self, points: np.ndarray, rng: np.random.Generator) -> Surfels:
         """Return contacts on the visible surface and on the sides behind its outline."""
         config = self.config
         tree = KDTree(points)
-        at = points[rng.permutation(len(points))[: config.n_surfels]]
+        visible = points[rng.permutation(len(points))[: config.n_surfels]]
         rim, outward = find_outline(points)
-        keep = rng.permutation(len(rim))[: config.n_hidden]
-        hidden = guess_hidden_sides(points, tree, rim[keep], outward[keep], config.edge_setback_m)
+        keep = rng.permutation(len(rim))[: config.n_occluded]
+        occluded = estimate_occluded_sides(points, tree, rim[keep], outward[keep], config.edge_setback_m)
         return Surfels(
-            points=np.concatenate([at, hidden.points]),
+            points=np.concatenate([visible, occluded.points]),
             normals=np.concatenate(
-                [smooth_normals(at, estimate_normals(tree, at)), smooth_normals(hidden.points, hidden.normals)]
+                [
+                    smooth_normals(visible, estimate_normals(tree, visible)),
+                    smooth_normals(occluded.points, occluded.normals),
+                ]
             ),
         )
 
-    def _draw_hands(self, surfels: Surfels, points: np.ndarray, count: int, rng: np.random.Generator) -> _Hands:
+    def _draw_candidates(
+        self, surfels: Surfels, points: np.ndarray, count: int, rng: np.random.Generator
+    ) -> _Candidates:
         """Draw `count` closing lines, even over the contacts, and an approach about each."""
         config = self.config
-        first, second = _antipodal_pairs(surfels, config)
+        first, second = _find_antipodal_pairs(surfels, config)
         if len(first) == 0:
             raise InvalidValueError(
                 f"No two of the {len(points)} points can be touched from opposite sides within "
-                f"{config.max_width_m} m; give a cloud of one object, narrower than that on some side."
+                f"{config.max_width_m} m; give a cloud of one object, narrower than that on some side.",
+                code="no_grasps",
             )
         picks = _draw_evenly(first, count, rng)
         first, second = first[picks], second[picks]
-        closing, widths, antipodality = _square_up(surfels, first, second)
+        closing, widths, antipodality = _align_closing(surfels, first, second)
         centers = (surfels.points[first] + surfels.points[second]) / 2.0
-        return _Hands(
+        return _Candidates(
             centers=centers,
             closing=closing,
-            approach=_turn_about(closing, centers, rng),
+            approach=_draw_approaches(closing, centers, rng),
             widths=widths,
             depths=rng.uniform(config.min_depth_m, config.max_depth_m, count),
             antipodality=antipodality,
         )
 
-    def _score(self, hands: _Hands, hits: np.ndarray, held: np.ndarray, points: np.ndarray) -> np.ndarray:
-        """Return scores (H,) in [0, 1]: square contacts, near the centre of mass, points between the pads, no hits."""
+    def _score(self, candidates: _Candidates, hits: np.ndarray, held: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """Return scores (H,) in [0, 1] from contact angles, distance to the centroid, points between the pads, hits."""
         middle = points.mean(axis=0)
         spread = np.sqrt(np.mean(np.sum((points - middle) ** 2, axis=1)))
-        away = np.linalg.norm(hands.centers - middle, axis=1) / spread
+        offset = np.linalg.norm(candidates.centers - middle, axis=1) / spread
         support = held / (held + 0.02 * min(len(points), self.config.n_collision_points))
-        quality = 0.45 * hands.antipodality + 0.25 * np.exp(-0.5 * away**2) + 0.3 * support
+        quality = 0.45 * candidates.antipodality + 0.25 * np.exp(-0.5 * offset**2) + 0.3 * support
         return quality / (1.0 + hits)
 
 
-def _poses(hands: _Hands) -> np.ndarray:
-    """Return the grasps (H, 4, 4)."""
-    T = np.tile(np.eye(4), (len(hands.widths), 1, 1))
-    T[:, :3, :3] = np.stack([np.cross(hands.closing, hands.approach), hands.closing, hands.approach], axis=2)
-    T[:, :3, 3] = hands.centers + hands.depths[:, None] * hands.approach
+def _make_poses(candidates: _Candidates) -> np.ndarray:
+    """Return the poses (H, 4, 4) of the candidates."""
+    closing, approach = candidates.closing, candidates.approach
+    T = np.tile(np.eye(4), (len(candidates.widths), 1, 1))
+    T[:, :3, :3] = np.stack([np.cross(closing, approach), closing, approach], axis=2)
+    T[:, :3, 3] = candidates.centers + candidates.depths[:, None] * approach
     return T
 
 
-def _antipodal_pairs(surfels: Surfels, config: AntipodalConfig) -> tuple[np.ndarray, np.ndarray]:
-    """Return the indices (P,), (P,) of contacts that see each other within both friction cones and the opening."""
+def _find_antipodal_pairs(surfels: Surfels, config: AntipodalConfig) -> tuple[np.ndarray, np.ndarray]:
+    """Return the indices (P,), (P,) of contact pairs within both friction cones and the opening."""
     points, normals = surfels.points, surfels.normals
     # |p_j − p_i|² and the two n·(p_j − p_i) of all pairs come from three matrix products.
     squared = np.sum(points**2, axis=1)
@@ -173,11 +185,13 @@ def _antipodal_pairs(surfels: Surfels, config: AntipodalConfig) -> tuple[np.ndar
     return first, second
 
 
-def _square_up(surfels: Surfels, first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _align_closing(
+    surfels: Surfels, first: np.ndarray, second: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return closing directions (H, 3), widths (H,) and antipodality (H,) in [0, 1] of contact pairs.
 
     The jaws close along the mean of the two normals, not along the line between two noisy points: on parallel faces
-    that lays the pads flat. Antipodality falls with the angle of the normals to each other and to that line.
+    that puts the pads flat. Antipodality falls with the angle of the normals to each other and to that line.
     """
     lines = surfels.points[second] - surfels.points[first]
     facing = surfels.normals[second] - surfels.normals[first]  # of length 2 where the normals are opposite
@@ -195,7 +209,7 @@ def _draw_evenly(first: np.ndarray, count: int, rng: np.random.Generator) -> np.
     return starts[drawn] + (rng.random(count) * sizes[drawn]).astype(np.intp)
 
 
-def _turn_about(closing: np.ndarray, centers: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def _draw_approaches(closing: np.ndarray, centers: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Return approaches (H, 3) square to `closing`, at angles evenly spread from the view ray's own."""
     rays = centers / np.linalg.norm(centers, axis=1, keepdims=True)
     straight = rays - np.sum(rays * closing, axis=1, keepdims=True) * closing

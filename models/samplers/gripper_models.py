@@ -1,4 +1,4 @@
-"""What a cloud says of a parallel jaw laid into it: points in the way of its fingers, points between its pads."""
+"""Collision and support counts of a parallel gripper at a grasp: points in its fingers, points between its pads."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ from typing import Protocol
 
 import numpy as np
 
-_CHUNK_HANDS = 256  # keeps a batch of hands × points inside the cache
+_CHUNK_POSES = 256  # keeps a batch of poses × points inside the cache
 
 
-class Hand(Protocol):
-    """A parallel jaw in the grasp frame: z approach, y closing, origin midway between the fingertips."""
+class GripperModel(Protocol):
+    """Parallel gripper in the grasp frame: z approach, y closing, origin midway between the fingertips."""
 
     @property
     def clearance_m(self) -> float:
-        """How far each open finger stands off its contact [m]."""
+        """Distance of each open finger from its contact [m]."""
         ...
 
     @property
@@ -33,34 +33,36 @@ class Hand(Protocol):
         ...
 
 
-def count_points(T: np.ndarray, widths_m: np.ndarray, cloud: np.ndarray, hand: Hand) -> tuple[np.ndarray, np.ndarray]:
-    """Return how many points (H,) the fingers and palm of each grasp hit, and how many (H,) lie between its pads.
+def count_points(
+    T: np.ndarray, widths_m: np.ndarray, cloud: np.ndarray, gripper: GripperModel
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the numbers of points (H,) that fingers and palm of each grasp hit, and (H,) between its pads.
 
     Args:
         T: (H, 4, 4) grasps.
-        widths_m: (H,) distance between the contacts; the fingers stand `hand.clearance_m` outside [m].
+        widths_m: (H,) distance between the contacts; the fingers are `gripper.clearance_m` outside [m].
         cloud: (M, 3) the object's points in the grasps' frame of reference [m].
-        hand: the jaw.
+        gripper: sizes of fingers and palm.
     """
     hits, held = np.zeros((2, len(T)), dtype=np.int64)
-    half_pad = hand.finger_width_m / 2.0
-    for start in range(0, len(T), _CHUNK_HANDS):
-        part = slice(start, start + _CHUNK_HANDS)
+    half_pad = gripper.finger_width_m / 2.0
+    for start in range(0, len(T), _CHUNK_POSES):
+        part = slice(start, start + _CHUNK_POSES)
         poses = T[part]
         x, y, z = (
             (axis @ cloud.T - np.sum(axis * poses[:, :3, 3], axis=1, keepdims=True)).astype(np.float32)
             for axis in np.ascontiguousarray(poses[:, :3, :3].transpose(2, 0, 1))  # strided rows never reach BLAS
         )
-        inner = (widths_m[part] / 2.0 + hand.clearance_m)[:, None]
+        inner = (widths_m[part] / 2.0 + gripper.clearance_m)[:, None]
         y = np.abs(y)
-        in_swath = (np.abs(x) < half_pad) & (z < 0.0) & (y < inner + hand.finger_thickness_m)
-        above_palm = z < -hand.finger_length_m
+        in_swath = (np.abs(x) < half_pad) & (z < 0.0) & (y < inner + gripper.finger_thickness_m)
+        above_palm = z < -gripper.finger_length_m
         hits[part] = np.count_nonzero(in_swath & ((y > inner) | above_palm), axis=1)
         held[part] = np.count_nonzero(in_swath & (y <= inner) & ~above_palm, axis=1)
     return hits, held
 
 
-def choose_hands(scores: np.ndarray, hits: np.ndarray, n: int, rng: np.random.Generator) -> np.ndarray:
-    """Return `n` indices, best score first: a random draw of the hands that hit nothing, then the fewest hits."""
+def choose_candidates(scores: np.ndarray, hits: np.ndarray, n: int, rng: np.random.Generator) -> np.ndarray:
+    """Return `n` indices, best score first: a random draw of the candidates without hits, then in order of hits."""
     order = np.argsort(hits + rng.random(len(hits)), kind="stable")[:n]
     return order[np.argsort(-scores[order], kind="stable")]

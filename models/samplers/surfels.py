@@ -1,4 +1,4 @@
-"""Where a finger could touch, guessed from the front of an object: visible surface, and sides behind its outline."""
+"""Possible finger contacts on an object seen from the front: visible surface, and occluded sides behind its outline."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from scipy.spatial import KDTree
 from hal.base.errors import InvalidValueError
 
 _NORMAL_NEIGHBORS = 30
-_MIN_DEPTH_M = 1e-3
+_MIN_DEPTH_M = 1e-3  # bearings divide by the depth
 _OUTLINE_NEIGHBORS = 12
 _OUTLINE_GAP_RAD = np.deg2rad(125.0)  # an inner pixel's neighbours leave no gap above 90°
 _EDGE_NEIGHBORS = 40
@@ -26,16 +26,16 @@ _FLAT_TURN_RAD = np.deg2rad(10.0)  # below a round body's turn over the probe, a
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Surfels:
-    """Points at which a finger could touch, with the outward direction of the surface there."""
+    """Possible contact points of a finger, with the outward direction of the surface there."""
 
     points: np.ndarray
     """(K, 3) [m]."""
     normals: np.ndarray
-    """(K, 3) outward unit normals, estimated or guessed."""
+    """(K, 3) outward unit normals, fitted on the visible side and assumed on the occluded one."""
 
 
 def estimate_normals(tree: KDTree, at: np.ndarray) -> np.ndarray:
-    """Return unit normals (K, 3) of the cloud in `tree` at points `at` (K, 3), turned to the camera at the origin."""
+    """Return unit normals (K, 3) of the cloud in `tree` at points `at` (K, 3), towards the camera at the origin."""
     _, neighbors = tree.query(at, k=min(_NORMAL_NEIGHBORS, tree.n))
     patches = tree.data[neighbors]
     centered = patches - patches.mean(axis=1, keepdims=True)
@@ -52,14 +52,15 @@ def find_outline(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     the surface. Corners are left out: their outward direction is no surface's normal.
 
     Raises:
-        ValueError: points beside or behind the camera, which stands at the origin.
+        InvalidValueError: points next to or behind the camera, which is at the origin.
     """
     basis = _view_basis(points)  # (3, 3) rows: right, down, forward
     in_view = points @ basis.T
     if in_view[:, 2].min() < _MIN_DEPTH_M:
         raise InvalidValueError(
             f"The cloud reaches to {in_view[:, 2].min():.3f} m along the view; it must be seen from its origin, "
-            "all of it in front. Give it in the camera frame."
+            "all of it in front. Give it in the camera frame.",
+            code="cloud_behind_camera",
         )
     bearings = in_view[:, :2] / in_view[:, 2:]
     tree = KDTree(bearings)
@@ -75,21 +76,21 @@ def find_outline(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return rim, _unit(outward - np.sum(outward * rays, axis=1, keepdims=True) * rays)
 
 
-def guess_hidden_sides(
+def estimate_occluded_sides(
     points: np.ndarray, tree: KDTree, rim: np.ndarray, outward: np.ndarray, setback_m: float
 ) -> Surfels:
-    """Guess the surface just behind the outline.
+    """Return contacts on the occluded surface just behind the outline.
 
-    Where the visible surface curves away towards the outline the hidden one continues it: the contact is on the
-    outline, its normal `outward`. Where it is flat up to the outline the outline is an edge: the hidden side is
-    taken to stand square on the visible face, and the contact lies `setback_m` behind the edge.
+    Where the visible surface curves towards the outline, the occluded one continues it: the contact is on the
+    outline, its normal `outward`. Where it is flat up to the outline, the outline is an edge: the occluded side is
+    assumed perpendicular to the visible face, and the contact is `setback_m` behind the edge.
 
     Args:
         points: (N, 3) the cloud [m].
         tree: of `points`.
         rim: (K,) indices of the outline's points.
         outward: (K, 3) unit vectors out of the outline, square to the view rays.
-        setback_m: how far behind an edge the pads touch [m].
+        setback_m: distance of the contacts behind an edge [m].
     """
     at = points[rim]
     if len(at) == 0:
@@ -101,7 +102,7 @@ def guess_hidden_sides(
     inner_normals = estimate_normals(tree, points[inner])
     turn = np.arccos(np.clip(np.sum(normals * inner_normals, axis=1), -1.0, 1.0))
     flat = (turn < _FLAT_TURN_RAD)[:, None]
-    half_gap = tree.query(at, k=2)[0][:, 1:].mean() / 2.0  # the last sample lies this far inside the true outline
+    half_gap = tree.query(at, k=2)[0][:, 1:].mean() / 2.0  # the last sample is this far inside the true outline
     return Surfels(
         points=at + half_gap * outward - np.where(flat, setback_m * normals, 0.0),
         normals=np.where(flat, square, outward),
@@ -109,7 +110,7 @@ def guess_hidden_sides(
 
 
 def smooth_normals(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """Return unit normals (K, 3) averaged with those near in place and direction: smoother faces, kept edges.
+    """Return unit normals (K, 3) averaged with those near in place and direction, which keeps edges.
 
     Fingers are long: 4° off the face moves their roots 3 mm, so the noise of one patch matters.
     """
@@ -146,7 +147,7 @@ def _square_to_rim(rim: np.ndarray, outward_rad: np.ndarray) -> np.ndarray:
     """Return the angle (K,) square to the line through each rim point's neighbours on the rim (K, 2) [rad].
 
     `outward_rad` (K,), the middle of the empty sector, is coarse: it chooses the side, and where the two disagree
-    (near a corner) the answer is NaN.
+    (near a corner) the result is NaN.
     """
     if len(rim) < _RIM_NEIGHBORS:
         return np.full(len(rim), np.nan)

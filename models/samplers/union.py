@@ -1,4 +1,4 @@
-"""Several grasp generators as one: all their grasps scored by one discriminator, the best kept."""
+"""Union of grasp generators: all their grasps scored by one discriminator, the best kept."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from models.types import GraspGenerator, GraspSet, check_object_cloud
 
 _LOG = logging.getLogger(__name__)
 _SAME_PLACE_M = 3e-3
-_SAME_WAY_RAD = np.deg2rad(8.0)
+_SAME_DIRECTION_RAD = np.deg2rad(8.0)
 
 
 class Scorer(Protocol):
-    """Judges grasps, whoever proposed them."""
+    """Scorer of grasps, independent of their generator."""
 
     def score(self, points: np.ndarray, grasps: GraspSet, seed: int) -> np.ndarray:
         """Return scores (N,) in [0, 1] of `grasps` on the object's `points` (M, 3) [m]."""
@@ -26,23 +26,24 @@ class Scorer(Protocol):
 
 
 class UnionSampler:
-    """A `GraspGenerator` that asks several and keeps the best.
+    """A `GraspGenerator` that combines several and keeps the best of their grasps.
 
-    Each member is asked for all `n` grasps, so that the union is not the worse for any of them: it costs what they
-    cost together, and the scoring. Of grasps that are nearly the same (3 mm, 8°, the jaws' two sides alike) only the
-    best counts. How many come from whom is left to the scores alone. A member that finds no grasps on a cloud is
-    passed over as long as another finds some.
+    Each member samples all `n` grasps, so that no member makes the union worse; the cost is the sum of theirs and the
+    scoring. Of grasps that are nearly the same (3 mm, 8°, both closing directions alike) only the best counts. The
+    scores alone decide the mix of members. A member without grasps on a cloud is skipped as long as another has some.
     """
 
     def __init__(self, members: Sequence[GraspGenerator], scorer: Scorer | None = None) -> None:
-        """Take the members; the scorer is the discriminator of the weights that ship if None.
+        """Store the members; without a scorer the discriminator of the shipped weights is loaded.
 
         Raises:
-            ValueError: fewer than two members.
+            InvalidValueError: fewer than two members.
             WeightsError: the discriminator's weights are missing or damaged.
         """
         if len(members) < 2:
-            raise InvalidValueError(f"A union of {len(members)} generator makes no sense; give two or more.")
+            raise InvalidValueError(
+                f"union: {len(members)} generator given, allowed is two or more.", code="union_members"
+            )
         if scorer is None:
             from models.diffusion.scorer import GraspScorer
 
@@ -53,49 +54,50 @@ class UnionSampler:
     def sample(self, points: np.ndarray, n: int, seed: int) -> GraspSet:
         """Return the best `n` of the members' grasps for `points` (M, 3) [m], best score first.
 
-        Where thinning leaves fewer than `n`, the best of the near copies fill up.
+        Where thinning leaves fewer than `n`, the best duplicates fill up.
 
         Raises:
-            ValueError: as `check_object_cloud`; or no member finds any grasp, with the first one's reason.
+            InvalidValueError: as `check_object_cloud`.
+            ValueError: no member finds any grasp; the first one's error.
         """
         points = check_object_cloud(points, n)
-        found = self._ask(points, n, seed)
+        found = self._sample_members(points, n, seed)
         T = np.concatenate([grasps.T_camera_grasps for grasps in found])
         widths = np.concatenate([grasps.widths_m for grasps in found])
         source = "union:" + "+".join(grasps.source for grasps in found)
         proposed = GraspSet(T_camera_grasps=T, scores=np.zeros(len(T)), widths_m=widths, source=source)
         scores = self._scorer.score(points, proposed, seed)
         order = np.argsort(-scores, kind="stable")
-        copies = find_copies(T[order])
-        chosen = np.concatenate([order[~copies], order[copies]])[:n]
+        duplicates = find_duplicates(T[order])
+        chosen = np.concatenate([order[~duplicates], order[duplicates]])[:n]
         chosen = chosen[np.argsort(-scores[chosen], kind="stable")]
         return GraspSet(T_camera_grasps=T[chosen], scores=scores[chosen], widths_m=widths[chosen], source=source)
 
-    def _ask(self, points: np.ndarray, n: int, seed: int) -> list[GraspSet]:
-        found, refusals = [], []
+    def _sample_members(self, points: np.ndarray, n: int, seed: int) -> list[GraspSet]:
+        found, failures = [], []
         for member in self.members:
             try:
                 found.append(member.sample(points, n, seed))
             except ValueError as err:
-                refusals.append(err)
+                failures.append(err)
         if not found:
-            raise refusals[0]
-        for refusal in refusals:
-            _LOG.info("a member of the union found no grasps: %s", refusal)
+            raise failures[0]
+        for failure in failures:
+            _LOG.info("a member of the union found no grasps: %s", failure)
         return found
 
 
-def find_copies(T: np.ndarray) -> np.ndarray:
-    """Return which (N,) of the poses `T` (N, 4, 4), best first, are nearly the same as a better one that is kept."""
+def find_duplicates(T: np.ndarray) -> np.ndarray:
+    """Return the mask (N,) of poses `T` (N, 4, 4), best first, that nearly equal a better one that is kept."""
     near = KDTree(T[:, :3, 3]).query_pairs(_SAME_PLACE_M, output_type="ndarray")
     near = np.sort(near, axis=1)
     first, second = near[:, 0], near[:, 1]
     approach = np.sum(T[first, :3, 2] * T[second, :3, 2], axis=1)
     closing = np.abs(np.sum(T[first, :3, 1] * T[second, :3, 1], axis=1))
-    same = (approach > np.cos(_SAME_WAY_RAD)) & (closing > np.cos(_SAME_WAY_RAD))
-    copies = np.zeros(len(T), dtype=bool)
+    same = (approach > np.cos(_SAME_DIRECTION_RAD)) & (closing > np.cos(_SAME_DIRECTION_RAD))
+    duplicates = np.zeros(len(T), dtype=bool)
     pairs = near[same]
     for better, worse in pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]:
-        if not copies[better]:
-            copies[worse] = True
-    return copies
+        if not duplicates[better]:
+            duplicates[worse] = True
+    return duplicates

@@ -41,23 +41,23 @@ _CHUNK_PERIOD_S = 0.02
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """What to measure."""
+    """Extent of the measurement."""
 
     seconds: float = 10.0
-    """How long each of the five measurements takes [s]."""
+    """Duration of each of the five measurements [s]."""
 
 
 def main(options: Options) -> None:
-    """Print percentiles of everything that crosses the link."""
-    table = Table("what", "p50", "p99", "max", "samples", title="the link between two processes, milliseconds")
+    """Print percentiles of the latencies of everything that crosses the link."""
+    table = Table("message", "p50", "p99", "max", "samples", title="the link between two processes, milliseconds")
     with hal_process() as config:
         for shared in (True, False):
             sent_ms, exposed_ms, was_shared = measure_frames(config, options.seconds, shared=shared)
-            way = "shared memory" if was_shared else "bytes"
-            _add(table, f"frame, {way}: sent to unpacked", sent_ms)
-            _add(table, f"frame, {way}: exposed to unpacked", exposed_ms)
+            transport = "shared memory" if was_shared else "bytes"
+            _add(table, f"frame, {transport}: sent to unpacked", sent_ms)
+            _add(table, f"frame, {transport}: exposed to unpacked", exposed_ms)
         _add(table, "chunk: sent to acknowledged", measure_chunks(config, options.seconds))
-        with _watching(config):
+        with _receive_frames(config):
             _add(table, "the same while frames flow", measure_chunks(config, options.seconds))
         gaps_ms = measure_states(config, options.seconds)
         _add(table, f"arm state: between two ({1e3 / gaps_ms.mean():.1f} a second)", gaps_ms)
@@ -69,7 +69,7 @@ def _add(table: Table, name: str, values: np.ndarray) -> None:
     table.add_row(name, f"{p50:.2f}", f"{p99:.2f}", f"{values.max():.2f}", str(len(values)))
 
 
-# --- The HAL's end ------------------------------------------------------------------------------------------------
+# --- HAL process ------------------------------------------------------------------------------------------------
 
 
 @contextmanager
@@ -99,7 +99,7 @@ def serve_mock(port: int) -> None:
 
 
 def make_frames(n: int = 4) -> list[RgbdFrame]:
-    """Return `n` frames of noise: what they show does not matter to the link, but no two are the same."""
+    """Return `n` different frames of noise: their contents do not affect the link."""
     rng = np.random.default_rng(0)
     size = (_INTRINSICS.height, _INTRINSICS.width)
     return [
@@ -114,11 +114,11 @@ def make_frames(n: int = 4) -> list[RgbdFrame]:
     ]
 
 
-# --- The runtime's end --------------------------------------------------------------------------------------------
+# --- Runtime --------------------------------------------------------------------------------------------
 
 
 def measure_frames(config: BusConfig, seconds: float, *, shared: bool) -> tuple[np.ndarray, np.ndarray, bool]:
-    """Return the latencies (N,) of frames from sending and from exposure [ms], and if they came in shared memory."""
+    """Return the latencies (N,) of frames from sending and from exposure [ms], and whether memory was shared."""
     clock, exposed_ms = WallClock(), []
     with RemoteCamera(BusConfig(port=config.port, shared_memory=shared), clock) as camera:
         for _ in range(round(30 * seconds)):
@@ -128,8 +128,8 @@ def measure_frames(config: BusConfig, seconds: float, *, shared: bool) -> tuple[
 
 
 def measure_chunks(config: BusConfig, seconds: float) -> np.ndarray:
-    """Return how long (N,) a chunk of 0.1 s takes until the servo has it and this process knows [ms]."""
-    clock, taken_ms = WallClock(), []
+    """Return the times (N,) from sending a chunk of 0.1 s to the servo's acknowledgement [ms]."""
+    clock, acknowledged_ms = WallClock(), []
     with RemoteArm(config, owner="measure_bus") as arm:
         arm.claim()
         status = arm.status()
@@ -144,13 +144,13 @@ def measure_chunks(config: BusConfig, seconds: float) -> np.ndarray:
             )
             watch = Stopwatch()
             arm.stream(chunk)
-            taken_ms.append(watch.lap_ms())
+            acknowledged_ms.append(watch.lap_ms())
             clock.sleep_until(clock.now_s() + _CHUNK_PERIOD_S)
-    return np.array(taken_ms)
+    return np.array(acknowledged_ms)
 
 
 @contextmanager
-def _watching(config: BusConfig) -> Iterator[None]:
+def _receive_frames(config: BusConfig) -> Iterator[None]:
     ended = threading.Event()
 
     def watch(camera: RemoteCamera) -> None:
@@ -168,7 +168,7 @@ def _watching(config: BusConfig) -> Iterator[None]:
 
 
 def measure_states(config: BusConfig, seconds: float) -> np.ndarray:
-    """Return the times (N,) between one arm state's arrival and the next one's [ms]."""
+    """Return the intervals (N,) between the arrivals of arm states [ms]."""
     clock: Clock = WallClock()
     arrived_s: list[float] = []
     with open_session(config, listen=False) as session:

@@ -1,7 +1,7 @@
-"""How good the twin's hand-eye calibrations are, over many seeds, and what they are worth to a grasp.
+"""Measure the errors of the twin's hand-eye calibrations over many seeds, and their effect on grasps.
 
-.venv/bin/python -m scripts.measure.measure_calibration                 20 calibrations of 20 poses each
-.venv/bin/python -m scripts.measure.measure_calibration --demos 9       and 9 demos each by drawing, calibration, truth
+.venv/bin/python -m scripts.measure.measure_calibration             # 20 calibrations of 20 poses each
+.venv/bin/python -m scripts.measure.measure_calibration --demos 9   # and 9 demos with each of three extrinsics
 """
 
 from __future__ import annotations
@@ -43,29 +43,29 @@ _SILENT = Console(file=io.StringIO())
 
 @dataclass(frozen=True, kw_only=True)
 class Config:
-    """How many runs, and of what."""
+    """Number of runs, and their contents."""
 
     first: int = 0
     """Seed of the first run."""
     runs: int = 20
-    """Calibrations, each with a noise, a mount and a place of the board of its own."""
+    """Calibrations, each with its own noise, extrinsics and board position."""
     poses: int = 20
     """Samples of each."""
     corrupted: int = 2
-    """Samples of the first run whose arm pose is falsified, to see whether they are found; 0 leaves that out."""
+    """Samples of the first run whose arm pose is falsified, to test the outlier detection; 0 skips that."""
     joint_noise_rad: float = 0.0
-    """Standard deviation of an error added to each measured joint, as an arm has that is not a twin [rad]."""
+    """Standard deviation of an error added to each measured joint, as on a real arm [rad]."""
     drive: bool = True
-    """Drive the arm from view to view. Without, it is put there, which takes a fifth of the time: the twin measures its
-    joints exactly wherever it stands."""
+    """Drive the arm from view to view. Without, its joints are set, which takes a fifth of the time: the twin measures
+    its joints exactly in any pose."""
     demos: int = 0
-    """Lock-step demos with the drawing's, the calibrated and the true mount each."""
+    """Lock-step demos with the drawing's, the calibrated and the true extrinsics each."""
     out: Path = Path("out/measure_calibration")
-    """Folder for runs.jsonl and demos.jsonl, a line as each is done."""
+    """Folder for runs.jsonl and demos.jsonl, one line for each run."""
 
 
 def main(config: Config) -> int:
-    """Measure; 0 when the aims of translation, rotation and coverage are met."""
+    """Measure; return 0 when the targets of translation, rotation and coverage are met."""
     console = Console(highlight=False)
     config.out.mkdir(parents=True, exist_ok=True)
     rows = []
@@ -83,17 +83,17 @@ def main(config: Config) -> int:
 def _run(config: Config, seed: int, console: Console) -> dict[str, float]:
     """Return the errors of one calibration."""
     with tempfile.TemporaryDirectory() as folder:
-        seen = _capture(config, seed, Path(folder) / "samples")
+        observed = _capture(config, seed, Path(folder) / "samples")
         if config.joint_noise_rad:
-            _blur_joints(seen, config.joint_noise_rad, seed)
-        result = solve(seen, seen.session.camera)
+            _blur_joints(observed, config.joint_noise_rad, seed)
+        result = solve(observed, observed.session.camera)
     if seed == 0 and config.corrupted:
-        _corrupt(seen, config.corrupted, console)
-    assert seen.session.truth is not None
-    error_m, error_rad = pose_error(np.array(seen.session.truth["T_mount_camera"]), result.T_mount_camera)
+        _corrupt(observed, config.corrupted, console)
+    assert observed.session.truth is not None
+    error_m, error_rad = pose_error(np.array(observed.session.truth["T_mount_camera"]), result.T_mount_camera)
     row = {
         "seed": seed,
-        "samples": len(seen.names),
+        "samples": len(observed.names),
         "error_mm": 1e3 * error_m,
         "error_deg": float(np.rad2deg(error_rad)),
         "uncertainty_mm": result.uncertainty_mm,
@@ -129,7 +129,7 @@ def _capture(config: Config, seed: int, folder: Path) -> SeenSamples:
 
 
 class _JumpingSearch(BoardSearch):
-    """A search whose arm is put where it is to look from."""
+    """Search that sets the arm's joints to each viewpoint."""
 
     def __init__(self, world: World, **devices: Any) -> None:
         super().__init__(**devices)
@@ -157,29 +157,29 @@ def _capture_by_jumps(scene: SceneConfig, poses: int, folder: Path) -> None:
     rig.camera.disconnect()
 
 
-def _blur_joints(seen: SeenSamples, sd_rad: float, seed: int) -> None:
-    """Put the arm of each sample where its joints, measured with an error, would have it."""
+def _blur_joints(observed: SeenSamples, sd_rad: float, seed: int) -> None:
+    """Recompute the arm pose of each sample from joints with a measurement error."""
     from z1_runtime.geometry.kinematics import Kinematics
 
     kinematics, rng = Kinematics(), np.random.default_rng([seed, 1])
-    for number, sample in enumerate(seen.samples):
+    for number, sample in enumerate(observed.samples):
         q = sample.q[:6] + rng.normal(0.0, sd_rad, 6)
-        seen.samples[number] = replace(sample, T_base_flange=kinematics.flange(q))
+        observed.samples[number] = replace(sample, T_base_flange=kinematics.flange(q))
 
 
-def _corrupt(seen: SeenSamples, n: int, console: Console) -> None:
-    """Say whether `n` samples whose arm pose is falsified by 10 mm are found."""
-    samples = list(seen.samples)
+def _corrupt(observed: SeenSamples, n: int, console: Console) -> None:
+    """Print whether `n` samples whose arm pose is falsified by 10 mm are dropped."""
+    samples = list(observed.samples)
     wrong = np.random.default_rng(0).choice(len(samples), n, replace=False)
     for number in wrong:
         T = samples[number].T_base_flange.copy()
         T[:3, 3] += [0.006, -0.008, 0.0]
         samples[number] = replace(samples[number], T_base_flange=T)
-    result = solve(replace(seen, samples=samples), seen.session.camera)
-    assert seen.session.truth is not None
-    error_m, error_rad = pose_error(np.array(seen.session.truth["T_mount_camera"]), result.T_mount_camera)
-    falsified = {seen.names[number] for number in wrong}
-    verdict = "all found, no other" if falsified == set(result.dropped) else "[red]not the same[/]"
+    result = solve(replace(observed, samples=samples), observed.session.camera)
+    assert observed.session.truth is not None
+    error_m, error_rad = pose_error(np.array(observed.session.truth["T_mount_camera"]), result.T_mount_camera)
+    falsified = {observed.names[number] for number in wrong}
+    verdict = "all dropped, no other" if falsified == set(result.dropped) else "[red]not the same[/]"
     dropped = ", ".join(sorted(result.dropped)) or "none"
     console.print(
         f"{n} samples falsified: {', '.join(sorted(falsified))}; dropped: {dropped}: {verdict}; "
@@ -192,22 +192,22 @@ def _show_runs(rows: list[dict[str, float]], console: Console) -> bool:
     mm, deg = (np.array([row[name] for row in rows]) for name in ("error_mm", "error_deg"))
     within_mm = mm <= [row["uncertainty_mm"] for row in rows]
     within_deg = deg <= [row["uncertainty_deg"] for row in rows]
-    table = Table("", "median", "worst", "aim", "within the uncertainty told")
+    table = Table("", "median", "maximum", "target", "within the stated uncertainty")
     table.add_row(
         "translation [mm]", f"{np.median(mm):.4f}", f"{mm.max():.4f}", "0.5", f"{within_mm.sum()}/{len(rows)}"
     )
     table.add_row("rotation [°]", f"{np.median(deg):.5f}", f"{deg.max():.5f}", "0.1", f"{within_deg.sum()}/{len(rows)}")
     console.print(table)
     covered = int((within_mm & within_deg).sum())
-    console.print(f"both within: {covered} of {len(rows)} (aim: 9 of 10)")
+    console.print(f"both within: {covered} of {len(rows)} (target: 9 of 10)")
     return bool(mm.max() <= 0.5 and deg.max() <= 0.1 and covered >= 0.9 * len(rows))
 
 
-# --- What it is worth ---------------------------------------------------------------------------------------
+# --- Effect on grasps ---------------------------------------------------------------------------------------
 
 
 def _demos(config: Config, console: Console) -> None:
-    """Lift three objects at up to three places with each of the mounts."""
+    """Lift three objects at up to three places with each of the extrinsics."""
     with tempfile.TemporaryDirectory() as folder:
         mounts = _mounts(config, Path(folder))
         lifted = dict.fromkeys(mounts, 0)
@@ -221,20 +221,20 @@ def _demos(config: Config, console: Console) -> None:
                         file.write(json.dumps(row) + "\n")
                         file.flush()
     console.print(
-        f"lifted of {config.demos}, the camera {1e3 * MOUNT_ERROR_M:g} mm and {MOUNT_ERROR_DEG:g}° off its drawing:"
+        f"lifted of {config.demos}, the camera {1e3 * MOUNT_ERROR_M:g} mm and {MOUNT_ERROR_DEG:g}° from its drawing:"
     )
     for name, count in lifted.items():
         console.print(f"  with {name}: {count}")
 
 
 def _mounts(config: Config, folder: Path) -> dict[str, Path]:
-    """Return a result file for the drawing's mount, the one calibrated with seed 0, and the true one."""
+    """Return a result file for the drawing's extrinsics, the ones calibrated with seed 0, and the true ones."""
     from calibration.results import Calibration, save_result
 
-    seen = _capture(config, 0, folder / "samples")
-    result = solve(seen, seen.session.camera)
-    session, truth = seen.session, seen.session.truth
-    assert truth is not None
+    observed = _capture(config, 0, folder / "samples")
+    result = solve(observed, observed.session.camera)
+    session, ground_truth = observed.session, observed.session.truth
+    assert ground_truth is not None
 
     def save(T_mount_camera: np.ndarray, base: HandEyeResult) -> Path:
         calibration = Calibration.of_hand_eye(
@@ -248,9 +248,9 @@ def _mounts(config: Config, folder: Path) -> dict[str, Path]:
         return save_result(folder, calibration)
 
     return {
-        "the drawing's mount": save(z1.T_FLANGE_CAMERA, result),
-        "the calibrated mount": save(result.T_mount_camera, result),
-        "the true mount": save(np.array(truth["T_mount_camera"]), result),
+        "the drawing's extrinsics": save(z1.T_FLANGE_CAMERA, result),
+        "the calibrated extrinsics": save(result.T_mount_camera, result),
+        "the true extrinsics": save(np.array(ground_truth["T_mount_camera"]), result),
     }
 
 

@@ -1,9 +1,9 @@
-"""How fast the D405's driver gets the twin's frames through librealsense, and what that costs.
+"""Measure rate, latency and processor time of the D405's driver with the twin's frames through librealsense.
 
     .venv/bin/python -m scripts.measure.measure_camera --seconds 20
 
-In free run at 30 Hz: frames a second, how old a frame is when it is handed out, and processor time of the whole
-process; then the same in lock-step, as fast as it goes.
+In free run at 30 Hz: frames per second, the age of a frame at delivery, and processor time of the whole process; then
+the same in lock-step, at full speed.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from sim_twin.model.world import World
 
 @dataclass(frozen=True, kw_only=True)
 class Config:
-    """How long, and at what size."""
+    """Duration and image size."""
 
     seconds: float = 10.0
-    """Of free run [s]."""
+    """Duration of the free run [s]."""
     width: int = 640
-    """Of the images [px]."""
+    """Image width [px]."""
     height: int = 480
-    """Of the images [px]."""
+    """Image height [px]."""
 
 
 def main(config: Config) -> None:
@@ -56,9 +56,7 @@ def main(config: Config) -> None:
     ages_ms = 1e3 * np.percentile(ages_s, [50, 99])
     missed = numbers[-1] - numbers[0] + 1 - len(numbers)
     print(f"free run   {len(numbers) / passed_s:5.1f} frames/s, {missed} missed of {missed + len(numbers)}, {health}")
-    print(
-        f"           age when handed out {ages_ms[0]:.1f} ms (p99 {ages_ms[1]:.1f}), {cpu_s / passed_s:.0%} of a core"
-    )
+    print(f"           age at delivery {ages_ms[0]:.1f} ms (p99 {ages_ms[1]:.1f}), {cpu_s / passed_s:.0%} of a core")
     with TwinSource(world) as source:
         camera = D405Camera(settings, source=source)
         camera.connect()
@@ -67,9 +65,7 @@ def main(config: Config) -> None:
             camera.wait_for_frame(1.0)
         cpu_s, passed_s = time.process_time() - cpu_s, clock.now_s() - start_s
         camera.disconnect()
-    print(
-        f"lock-step  {count / passed_s:5.1f} frames/s, {1e3 * cpu_s / count:.1f} ms of processor a frame, with physics"
-    )
+    print(f"lock-step  {count / passed_s:5.1f} frames/s, {1e3 * cpu_s / count:.1f} ms of processor/frame, with physics")
 
 
 if __name__ == "__main__":

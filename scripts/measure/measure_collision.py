@@ -22,7 +22,7 @@ from z1_runtime.geometry.gripper_mesh import gripper_shape
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Config:
-    """What to measure."""
+    """Extent of the measurement."""
 
     n_candidates: int = 800
     """Gripper poses."""
@@ -31,13 +31,13 @@ class Config:
     threshold_m: float = 0.002
     """Distance that counts as a hit (the paper's) [m]."""
     repeats: int = 15
-    """The median of so many runs is shown."""
+    """Number of runs; their median is shown."""
     seed: int = 0
-    """Of scene and poses."""
+    """Seed of scene and poses."""
 
 
 def make_scene(n_points: int, rng: np.random.Generator) -> np.ndarray:
-    """Return a table with three boxes standing on it, (n_points, 3) [m]."""
+    """Return the points (n_points, 3) of a table with three boxes on it [m]."""
     table = np.column_stack([rng.uniform(0.2, 0.9, n_points // 2), rng.uniform(-0.4, 0.4, n_points // 2)])
     parts = [np.column_stack([table, rng.normal(0.0, 0.001, len(table))])]
     for y in (-0.15, 0.0, 0.15):
@@ -59,7 +59,7 @@ def make_poses(n: int, rng: np.random.Generator) -> np.ndarray:
 
 
 def median_ms(work: Callable[[], object], repeats: int) -> float:
-    """Return the median time of `work` [ms], the first, compiling, run left out."""
+    """Return the median time of `work` [ms], without the first run, which compiles."""
     work()
     times = []
     for _ in range(repeats):
@@ -88,14 +88,14 @@ def main(config: Config) -> None:
     hits = index.collides(T, vertices, config.threshold_m)
     equal = bool((hits == by_tree()).all())
     title = f"{len(T)} poses × {len(vertices)} vertices against {len(points)} points, {hits.mean():.0%} of them hit"
-    table = Table("what", "median ms", title=title)
+    table = Table("step", "median ms", title=title)
     table.add_row("build the voxel index", f"{median_ms(lambda: SceneIndex(points), config.repeats):.1f}")
     rows = {"check, as posed": T, "check, only those that are free": T[~hits], "check, far above the scene": free}
     for name, poses in rows.items():
         ms = median_ms(lambda p=poses: index.collides(p, vertices, config.threshold_m), config.repeats)
         table.add_row(f"{name} ({len(poses)})", f"{ms:.1f}")
     table.add_row("the same by KD-tree", f"{median_ms(by_tree, 2):.0f}")
-    table.add_row("the same answers", "yes" if equal else "[red]no[/red]")
+    table.add_row("the same results", "yes" if equal else "[red]no[/red]")
     Console().print(table)
     if not equal:
         raise SystemExit("the voxel index and the KD-tree disagree.")

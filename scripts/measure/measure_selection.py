@@ -1,4 +1,4 @@
-"""The selection stage on one core: `OMP_NUM_THREADS=1 python -m scripts.measure.measure_selection [repeats]`."""
+"""Latency of the selection on one core: `OMP_NUM_THREADS=1 python -m scripts.measure.measure_selection [repeats]`."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ UP = np.array([0.0, -1.0, 0.0])
 
 
 def make_box_view(rng: np.random.Generator) -> np.ndarray:
-    """Return (5000, 3) points [m] on three visible faces of a 60 × 100 × 180 mm box, 0.4 m away, 0.7 mm noise."""
+    """Return (5000, 3) points [m] on three visible faces of a 60 × 100 × 180 mm box, at 0.4 m, with 0.7 mm noise."""
     half = np.array([0.03, 0.09, 0.05])
     points = rng.uniform(-half, half, (N_POINTS, 3))
     face = rng.integers(0, 3, N_POINTS)
@@ -41,7 +41,7 @@ def make_random_grasps(rng: np.random.Generator) -> GraspSet:
 
 
 def measure_ms(run: Callable[[], object], repeats: int) -> np.ndarray:
-    """Return the times (repeats,) of `run` [ms], after two calls that do not count."""
+    """Return the times (repeats,) of `run` [ms], after two warm-up calls."""
     times = []
     for index in range(repeats + 2):
         watch = Stopwatch()
@@ -52,7 +52,7 @@ def measure_ms(run: Callable[[], object], repeats: int) -> np.ndarray:
 
 
 def main() -> None:
-    """Print median and 95th percentile of each case beside its budget."""
+    """Print median and 95th percentile of each case, and its budget."""
     repeats = int(sys.argv[1]) if len(sys.argv) > 1 else 200
     rng = np.random.default_rng(0)
     points, grasps = make_box_view(rng), make_random_grasps(rng)

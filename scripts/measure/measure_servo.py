@@ -1,11 +1,11 @@
-"""Measure how evenly the 500 Hz servo ticks on this machine, beside a bare C loop under the same load.
+"""Measure the period jitter of the 500 Hz servo on this machine, and of a bare C loop under the same load.
 
-    python -m scripts.measure.measure_servo --seconds 60 --beside vision
+    python -m scripts.measure.measure_servo --seconds 60 --load vision
 
-The servo (with the mock arm) and the bare loop run at the same time, each in its own process, so that both meet the
-same stalls, and both ask for SCHED_FIFO. The bare loop is C, compiled with `cc`; without a compiler it is libc's
+The servo (with the mock arm) and the bare loop run at the same time, each in its own process, so that both get the
+same stalls, and both request SCHED_FIFO. The bare loop is C, compiled with `cc`; without a compiler it is libc's
 clock_nanosleep called by ctypes.
-The aim: the servo's p99 and p99.9 are at most 1.3 times the bare loop's, and no setpoint is skipped.
+The target: the servo's p99 and p99.9 are at most 1.3 times the bare loop's, and no setpoint is skipped.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ int main(int argc, char **argv) {
     double *out = malloc(n * sizeof *out);
     struct timespec due, now;
     struct sched_param priority = { .sched_priority = 80 };
-    sched_setscheduler(0, SCHED_FIFO, &priority);  // as the servo does; goes on without the right
+    sched_setscheduler(0, SCHED_FIFO, &priority);  // as the servo does; continues without the permission
     clock_gettime(CLOCK_MONOTONIC, &due);
     for (long i = 0; i < n; i++) {
         due.tv_nsec += period;
@@ -60,14 +60,14 @@ int main(int argc, char **argv) {
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """What to measure."""
+    """Duration and load of the measurement."""
 
     seconds: float = 20.0
-    """How long [s]."""
-    beside: Literal["nothing", "vision"] = "nothing"
-    """What else the machine does meanwhile: `vision` is a process that looks for objects without a pause."""
+    """Duration [s]."""
+    load: Literal["nothing", "vision"] = "nothing"
+    """Other load of the machine: `vision` is a process that detects objects without a pause."""
     cpu: int | None = None
-    """Core for the servo's thread alone; by default any."""
+    """Core that the servo's thread is pinned to; by default any."""
 
 
 def main(options: Options) -> None:
@@ -75,21 +75,24 @@ def main(options: Options) -> None:
     n = round(options.seconds / CONTROL_PERIOD_S)
     with tempfile.TemporaryDirectory() as folder:
         command, kind = _bare_command(Path(folder), n)
-        with _busy(options.beside, Path(folder)) as looks, subprocess.Popen(command, stdout=subprocess.PIPE) as bare:
-            looked = looks()
-            servo_ms, account = _run_servo(options)
-            looked = looks() - looked
+        with (
+            _run_load(options.load, Path(folder)) as detections,
+            subprocess.Popen(command, stdout=subprocess.PIPE) as bare,
+        ):
+            before = detections()
+            servo_ms, summary = _run_servo(options)
+            count = detections() - before
             assert bare.stdout is not None
             bare_ms = 1e3 * np.diff(np.frombuffer(bare.stdout.read()))
     print(f"period [ms]         p50     p99   p99.9     max  late by more than half a period   ({kind})")
     for name, periods in (("bare loop", bare_ms), ("servo", servo_ms)):
         figures = " ".join(f"{x:7.3f}" for x in (*np.percentile(periods, [50, 99, 99.9]), periods.max()))
         print(f"{name:15s} {figures}  {(periods > 1.5e3 * CONTROL_PERIOD_S).sum()} of {len(periods)}")
-    print(account)
-    if options.beside != "nothing":
-        print(f"beside it: {options.beside}, {looked / options.seconds:.1f} looks/s")
+    print(summary)
+    if options.load != "nothing":
+        print(f"load: {options.load}, {count / options.seconds:.1f} detections/s")
     ratios = np.percentile(servo_ms, [99, 99.9]) / np.percentile(bare_ms, [99, 99.9])
-    print(f"p99 of the servo is {ratios[0]:.2f}, p99.9 {ratios[1]:.2f} times the bare loop's (aim: 1.3 or less)")
+    print(f"p99 of the servo is {ratios[0]:.2f}, p99.9 {ratios[1]:.2f} times the bare loop's (target: 1.3 or less)")
 
 
 def _bare_command(folder: Path, n: int) -> tuple[list[str], str]:
@@ -108,7 +111,7 @@ def _bare_command(folder: Path, n: int) -> tuple[list[str], str]:
 
 
 def run_bare_python() -> None:
-    """Do what the C loop does, with libc's clock_nanosleep, and write the wake-up times to stdout."""
+    """Run the C loop's algorithm with libc's clock_nanosleep, and write the wake-up times to stdout."""
     n = int(sys.argv[1])
     clock, sleep_until = WallClock(), _make_nanosleep()
     times, due_s = np.zeros(n), clock.now_s()
@@ -135,19 +138,19 @@ def _make_nanosleep() -> Callable[[float], None]:
 
 
 @contextmanager
-def _busy(beside: str, folder: Path) -> Iterator[Callable[[], int]]:
-    """Keep the machine busy with what is wanted, from when it is loaded; yields how often it has looked so far."""
-    if beside == "nothing":
+def _run_load(load: str, folder: Path) -> Iterator[Callable[[], int]]:
+    """Run the load within, once it has started; yield a function that returns the number of detections so far."""
+    if load == "nothing":
         yield lambda: 0
         return
-    marks = folder / "looks"  # a byte for each
+    marks = folder / "detections"  # one byte for each
     code = "from scripts.measure.measure_servo import *; run_vision()"
     with marks.open("wb") as out, subprocess.Popen([sys.executable, "-c", code], stdout=out) as process:
         pause = threading.Event()
         while not marks.stat().st_size:
             pause.wait(0.1)
             if process.poll() is not None:
-                raise RuntimeError(f"the {beside} process ended with code {process.returncode}; its error is above.")
+                raise RuntimeError(f"the {load} process ended with code {process.returncode}; its error is above.")
         try:
             yield lambda: marks.stat().st_size
         finally:
@@ -155,7 +158,7 @@ def _busy(beside: str, folder: Path) -> Iterator[Callable[[], int]]:
 
 
 def run_vision() -> None:
-    """Look for objects in a frame of the twin's, again and again, and write a byte to stdout each time."""
+    """Detect objects in a frame of the twin repeatedly, and write a byte to stdout each time."""
     from hal.base.z1 import Q_HOME, T_FLANGE_CAMERA
     from sim_twin.backends import make_rig
     from z1_runtime.geometry.kinematics import Kinematics
@@ -172,7 +175,7 @@ def run_vision() -> None:
 
 
 class _TimedServo(Servo):
-    """A servo that keeps its wake-up times, what each tick costs, and how far it has played."""
+    """Servo that records its wake-up times, the duration of each tick, and its time in the trajectory."""
 
     def __init__(self, arm: MockArm, clock: WallClock, capacity: int) -> None:
         super().__init__(arm, clock)
@@ -190,7 +193,7 @@ class _TimedServo(Servo):
 
 
 def _run_servo(options: Options) -> tuple[np.ndarray, str]:
-    """Return the periods [ms] of a servo that is moving, and its account of itself."""
+    """Return the periods [ms] of a moving servo, and a summary of its status."""
     clock = WallClock()
     capacity = round(1.2 * options.seconds / CONTROL_PERIOD_S)
     servo = _TimedServo(MockArm(clock, q=(Q_MIN + Q_MAX) / 2), clock, capacity)
@@ -208,11 +211,11 @@ def _run_servo(options: Options) -> tuple[np.ndarray, str]:
     cost_us = 1e3 * np.percentile(servo.cost_ms[:count], [50, 99])
     skipped = int((np.diff(servo.played_s[:count]) > 1.5 * CONTROL_PERIOD_S).sum())
     why = f"; it ended: {status.reason}" if status.reason else ""
-    account = (
-        f"servo: {status.overruns} overruns counted, {skipped} setpoints skipped of {count}; a tick costs p50 "
+    summary = (
+        f"servo: {status.overruns} overruns counted, {skipped} setpoints skipped of {count}; a tick takes p50 "
         f"{cost_us[0]:.0f} us, p99 {cost_us[1]:.0f} us; its thread was granted {granted}{why}"
     )
-    return 1e3 * np.diff(servo.woke_s[:count]), account
+    return 1e3 * np.diff(servo.woke_s[:count]), summary
 
 
 def _swing(servo: Servo, ended: threading.Event) -> None:

@@ -1,10 +1,10 @@
-"""Measures the detector on held-out pictures and on the 81 scenario views; writes `models/weights/detector.json`.
+"""Evaluate the detector on held-out pictures and on the 81 scenario views; writes `models/weights/detector.json`.
 
     nice -n 10 python -m scripts.train.evaluate_detector                  # a minute on two cores
     python -m scripts.train.evaluate_detector --weights some.npz --out out/detector/some.json
 
-Held-out pictures come from `make_detection_dataset`: other seeds, so other props, textures and lights. A picture with
-what was found is written beside the figures.
+Held-out pictures come from `make_detection_dataset`: other seeds, so other props, textures and lights. A picture of the
+detections is written next to the figures.
 """
 
 from __future__ import annotations
@@ -26,26 +26,26 @@ from hal.base import z1
 from hal.base.clock import Stopwatch
 from hal.base.errors import MissingFileError
 from models.detector.detector import YoloConfig, YoloModel, best_of, labels_for
+from models.detector.metrics import MatchedDetections, mask_iou, match_detections
 from models.detector.weights import detector_path
 from models.types import Detection
-from scripts.train.detection_measures import Tally, mask_iou, match
 from scripts.train.make_detection_dataset import read_labels
 from sim_twin.benchmark.episodes.scenarios import PAPER_OBJECTS, Scenario, grid
 from sim_twin.camera.d405 import INTRINSICS, measure_colour
 from sim_twin.detection_data.props import CLASSES
 from sim_twin.detection_data.scenes import Appearance, Label, Picture, draw_scenario
 
-WANTED = {
+TARGETS = {
     "box_map50": 0.97,
     "mask_map50_95": 0.75,
     "empty_with_false_box": 0,
     "views_twin": 81,
     "median_ms": 40.0,
 }
-"""What the detector shall reach; the last two: of 81 views, at most."""
+"""Targets of the figures; those of errors and time are maxima."""
 VIEW_IOU = 0.8
-_LOWEST_CONFIDENCE, _MOST_RANKED = 0.001, 300
-"""What counts for the average precision, and with every class of a box: as ultralytics' validator has it."""
+_MIN_CONFIDENCE, _MAX_DETECTIONS = 0.001, 300
+"""Limits of the average precision, with every class of a box: those of ultralytics' validator."""
 _JAW_RAD = -1.0
 _STAGE_SEED = 4_000_000
 _COLOURS = {"bottle": (255, 60, 255), "box": (60, 230, 60), "cylinder": (255, 80, 60)}
@@ -53,34 +53,34 @@ _COLOURS = {"bottle": (255, 60, 255), "box": (60, 230, 60), "cylinder": (255, 80
 
 @dataclass(frozen=True, kw_only=True)
 class Config:
-    """What to measure, and on what."""
+    """Detector, data and extent of the evaluation."""
 
     weights: Path | None = None
-    """A file that `models.detector.detector` reads; the shipped one if not given."""
+    """A weights file of `models.detector.detector`; by default the shipped one."""
     runtime: str = "auto"
     """One of `models.detector.detector`'s runtimes."""
     data: Path = Path("out/detector/data")
-    """Folder that `make_detection_dataset` wrote."""
-    most: int = 500
-    """Held-out pictures to look at."""
+    """Folder of `make_detection_dataset`."""
+    pictures: int = 500
+    """Maximum number of held-out pictures."""
     repeats: int = 100
-    """Pictures over which the time is measured."""
+    """Pictures over which the latency is measured."""
     out: Path | None = None
-    """Where the figures go; beside the weights if not given."""
+    """File of the figures; next to the weights by default."""
 
 
 def main(config: Config) -> None:
-    """Measure, print and write."""
+    """Evaluate the detector, print and write the figures."""
     detector = YoloModel(YoloConfig(weights=config.weights, runtime=config.runtime))
     figures = {"runtime": detector.runtime, "min_confidence": detector.config.min_confidence}
-    lavish = YoloModel(replace(detector.config, every_class=True, max_detections=_MOST_RANKED))
-    figures |= measure_held_out(detector, lavish, config.data, config.most)
+    exhaustive = YoloModel(replace(detector.config, every_class=True, max_detections=_MAX_DETECTIONS))
+    figures |= measure_held_out(detector, exhaustive, config.data, config.pictures)
     figures |= measure_empty(detector, config.data)
     tiles = []
     for look in get_args(Appearance):
-        seen = measure_views(detector, twin_views() if look == "twin" else spoilt_views(look), look)
-        figures |= seen.figures
-        tiles += seen.tiles
+        views = measure_views(detector, draw_twin_views() if look == "twin" else draw_varied_views(look), look)
+        figures |= views.figures
+        tiles += views.tiles
     figures |= measure_time(detector, config.repeats)
     out = config.out or (config.weights or detector_path()).with_suffix(".json")
     out.write_text(json.dumps(figures, indent=1) + "\n")
@@ -88,32 +88,32 @@ def main(config: Config) -> None:
     Console().print(_table(figures))
 
 
-def measure_held_out(detector: YoloModel, lavish: YoloModel, data: Path, most: int) -> dict[str, object]:
-    """Return mean average precision of boxes and masks over the held-out pictures, of all and by their look.
+def measure_held_out(detector: YoloModel, exhaustive: YoloModel, data: Path, pictures: int) -> dict[str, object]:
+    """Return mean average precision of boxes and masks over the held-out pictures, of all and by appearance.
 
     Args:
-        detector: as it is used; what it gives out makes precision and recall.
-        lavish: the same, of which every class of a box counts; what it gives out makes the average precision.
+        detector: in its normal configuration, for precision and recall.
+        exhaustive: the same with every class of a box, for the average precision.
         data: folder of the pictures.
-        most: how many of them.
+        pictures: maximum number of them.
     """
-    looks: dict[str, Tally] = {}
-    good = [0, 0, 0]  # at the default threshold: found and right, found, there
-    images = _images(data, "val")[:most]
+    by_look: dict[str, MatchedDetections] = {}
+    counts = [0, 0, 0]  # at the default threshold: true positives, detections, labels
+    images = _list_images(data, "val")[:pictures]
     for image in track(images, description="held-out pictures"):
         colour = read_image(image)
         labels = read_labels(label_file(image), colour.shape[:2])
-        found = lavish.detect(colour, _LOWEST_CONFIDENCE)
-        by_box, by_mask = match(found, labels)
-        tally = looks.setdefault(image.stem.partition("_")[2], Tally())
+        found = exhaustive.detect(colour, _MIN_CONFIDENCE)
+        by_box, by_mask = match_detections(found, labels)
+        matched = by_look.setdefault(image.stem.partition("_")[2], MatchedDetections())
         numbers = [CLASSES.index(detection.label) for detection in found]
-        tally.rows += list(zip(by_box, by_mask, [d.confidence for d in found], numbers, strict=True))
-        tally.targets += [CLASSES.index(label.name) for label in labels]
-        hits, _ = match(given := detector.detect(colour), labels)
-        good = [a + int(b) for a, b in zip(good, (hits[:, 0].sum(), len(given), len(labels)), strict=True)]
-    together = Tally(
-        rows=[row for tally in looks.values() for row in tally.rows],
-        targets=[number for tally in looks.values() for number in tally.targets],
+        matched.rows += list(zip(by_box, by_mask, [d.confidence for d in found], numbers, strict=True))
+        matched.targets += [CLASSES.index(label.name) for label in labels]
+        hits, _ = match_detections(normal := detector.detect(colour), labels)
+        counts = [a + int(b) for a, b in zip(counts, (hits[:, 0].sum(), len(normal), len(labels)), strict=True)]
+    together = MatchedDetections(
+        rows=[row for matched in by_look.values() for row in matched.rows],
+        targets=[number for matched in by_look.values() for number in matched.targets],
     )
     figures: dict[str, object] = {"held_out_pictures": len(images), "held_out_objects": len(together.targets)}
     for name, column in (("box", 0), ("mask", 1)):
@@ -121,26 +121,27 @@ def measure_held_out(detector: YoloModel, lavish: YoloModel, data: Path, most: i
         figures[f"{name}_map50"], figures[f"{name}_map50_95"] = _round(precision[:, 0].mean()), _round(precision.mean())
         figures[f"{name}_ap50_95"] = dict(zip(CLASSES, (_round(p) for p in precision.mean(axis=1)), strict=True))
         figures[f"{name}_map50_by_look"] = {
-            look: _round(tally.average_precision(column)[:, 0].mean()) for look, tally in sorted(looks.items())
+            look: _round(matched.average_precision(column)[:, 0].mean()) for look, matched in sorted(by_look.items())
         }
-    figures["precision"], figures["recall"] = _round(good[0] / max(good[1], 1)), _round(good[0] / max(good[2], 1))
+    right, found_count, label_count = counts
+    figures["precision"], figures["recall"] = _round(right / max(found_count, 1)), _round(right / max(label_count, 1))
     return figures
 
 
 def measure_empty(detector: YoloModel, data: Path) -> dict[str, object]:
-    """Return how often something is seen where nothing is, at the default threshold."""
-    images = _images(data, "empty")
-    most = [max((d.confidence for d in detector.detect(read_image(i), 0.05)), default=0.0) for i in images]
-    wrong = sum(confidence > detector.config.min_confidence for confidence in most)
+    """Return the number of false boxes on pictures without objects, at the default threshold."""
+    images = _list_images(data, "empty")
+    highest = [max((d.confidence for d in detector.detect(read_image(i), 0.05)), default=0.0) for i in images]
+    wrong = sum(confidence > detector.config.min_confidence for confidence in highest)
     return {
         "empty_pictures": len(images),
         "empty_with_false_box": int(wrong),
-        "empty_highest_confidence": _round(max(most)),
+        "empty_highest_confidence": _round(max(highest)),
     }
 
 
-def twin_views() -> Iterator[tuple[Scenario, Picture]]:
-    """Yield the 81 scenarios as the twin's wrist camera sees them from home, noise included."""
+def draw_twin_views() -> Iterator[tuple[Scenario, Picture]]:
+    """Yield the 81 scenarios in the twin's wrist camera at home, noise included."""
     import mujoco
 
     from sim_twin.camera.render import make_renderer
@@ -166,8 +167,8 @@ def twin_views() -> Iterator[tuple[Scenario, Picture]]:
         renderer.close()
 
 
-def spoilt_views(look: Appearance) -> Iterator[tuple[Scenario, Picture]]:
-    """Yield the same poses, each in a room and through a camera of its own."""
+def draw_varied_views(look: Appearance) -> Iterator[tuple[Scenario, Picture]]:
+    """Yield the same poses, each with a random room and camera."""
     from sim_twin.detection_data.scene_renderer import Stage
 
     stage = Stage(_STAGE_SEED)
@@ -181,36 +182,36 @@ def spoilt_views(look: Appearance) -> Iterator[tuple[Scenario, Picture]]:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Seen:
-    """What came of looking at the scenario views."""
+class ViewResults:
+    """Figures of the scenario views, with pictures of some."""
 
     figures: dict[str, object]
     tiles: list[np.ndarray]
     """Some of the views, drawn on."""
 
 
-def measure_views(detector: YoloModel, views: Iterator[tuple[Scenario, Picture]], look: str) -> Seen:
-    """Return in how many of the 81 views the right object is found with an IoU of at least 0.8, and which fail."""
+def measure_views(detector: YoloModel, views: Iterator[tuple[Scenario, Picture]], look: str) -> ViewResults:
+    """Return the number of the 81 views in which the object is found with an IoU of at least 0.8, and the failures."""
     ious: dict[str, float] = {}
     tiles = []
     for number, (scenario, picture) in enumerate(track(views, description=f"views, {look}", total=81)):
         found = detector.detect(picture.colour)
         best = best_of(found, labels_for(scenario.object, detector.classes))
-        seen = best.mask if best is not None else None
-        truth = picture.labels[0].mask if picture.labels else np.zeros(picture.colour.shape[:2], dtype=bool)
-        ious[scenario.key] = 0.0 if seen is None else mask_iou(seen, truth)
+        mask = best.mask if best is not None else None
+        ground_truth = picture.labels[0].mask if picture.labels else np.zeros(picture.colour.shape[:2], dtype=bool)
+        ious[scenario.key] = 0.0 if mask is None else mask_iou(mask, ground_truth)
         if number % 27 == 13:
             tiles.append(draw_found(picture.colour, found))
     passed = sum(1 for iou in ious.values() if iou >= VIEW_IOU)
     failed = {key: _round(iou) for key, iou in ious.items() if iou < VIEW_IOU}
     median = _round(float(np.median(list(ious.values()))))
     figures = {f"views_{look}": passed, f"views_{look}_median_iou": median, f"views_{look}_failed": failed}
-    return Seen(figures=figures, tiles=tiles)
+    return ViewResults(figures=figures, tiles=tiles)
 
 
 def measure_time(detector: YoloModel, repeats: int) -> dict[str, object]:
-    """Return the median time of a look at 640×480 [ms]."""
-    image = next(twin_views())[1].colour
+    """Return the median latency at 640×480 [ms]."""
+    image = next(draw_twin_views())[1].colour
     detector.detect(image)
     times = []
     for _ in range(repeats):
@@ -221,8 +222,8 @@ def measure_time(detector: YoloModel, repeats: int) -> dict[str, object]:
 
 
 def write_sheet(detector: YoloModel, data: Path, tiles: list[np.ndarray], path: Path) -> None:
-    """Write a sheet of what was found: some scenario views, then the first held-out pictures."""
-    images = _images(data, "val")
+    """Write a sheet of detections: some scenario views, then some held-out pictures."""
+    images = _list_images(data, "val")
     held_out = [read_image(image) for image in images[:: max(len(images) // 10, 1)][:10]]
     tiles = tiles + [draw_found(colour, detector.detect(colour)) for colour in held_out]
     small = [cv2.resize(tile, (320, 240), interpolation=cv2.INTER_AREA) for tile in tiles]
@@ -249,31 +250,33 @@ def read_image(path: Path) -> np.ndarray:
     image = cv2.imread(str(path))
     if image is None:
         raise MissingFileError(
-            f"{path} is not a picture; make the data anew with scripts.train.make_detection_dataset."
+            f"{path} is not a picture; make the data again with `python -m scripts.train.make_detection_dataset`.",
+            code="no_picture",
         )
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
 def label_file(image: Path) -> Path:
-    """Return where the labels of `image` lie."""
+    """Return the path of the labels of `image`."""
     folder = image.parent
     return folder.parent.parent.parent / "labels" / folder.parent.name / folder.name / f"{image.stem}.txt"
 
 
-def _images(data: Path, split: str) -> list[Path]:
+def _list_images(data: Path, split: str) -> list[Path]:
     images = sorted((data / "images" / split).glob("*/*.jpg"))
     if not images:
         raise MissingFileError(
-            f"{data} has no {split} pictures; make them with `python -m scripts.train.make_detection_dataset`."
+            f"{data} has no {split} pictures; make them with `python -m scripts.train.make_detection_dataset`.",
+            code="no_data",
         )
     return images
 
 
 def _table(figures: dict) -> Table:
-    table = Table("figure", "measured", "wanted", title="Detector")
+    table = Table("figure", "measured", "target", title="Detector")
     for key, value in figures.items():
-        wanted = WANTED.get(key)
-        table.add_row(key, str(value), "" if wanted is None else str(wanted))
+        target = TARGETS.get(key)
+        table.add_row(key, str(value), "" if target is None else str(target))
     return table
 
 

@@ -1,10 +1,9 @@
-"""Makes the detector's pictures: random scenes of the twin, with exact masks as polygons.
+"""Make the detector's pictures: random scenes of the twin, with exact masks as polygons.
 
     python -m scripts.train.make_detection_dataset                # train, val and empty into out/detector/data
     python -m scripts.train.make_detection_dataset --jobs 2       # in two processes
 
-Every shard of pictures comes from its own seed and has props of its own. Shards that exist are kept, so an interrupted
-run goes on where it stopped.
+Every shard of pictures has its own seed and props. Existing shards are kept, so an interrupted run resumes.
 """
 
 from __future__ import annotations
@@ -31,21 +30,21 @@ _CHANGES = {
     "train": {"crowd": 0.5, "empty": 0.1, "twin": 0.25, "own": 0.35, "distractors": 6.0},
     "empty": {"empty": 1.0},
 }
-"""In what the splits differ from the mix: a training picture holds more of all that can be mistaken."""
+"""Differences of the splits from the mix: training pictures hold more objects that can be confused."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Config:
-    """How many pictures, and of what."""
+    """Numbers of pictures, and their mix of scenes."""
 
     train: int = 20000
-    """Pictures to learn from."""
+    """Training pictures."""
     val: int = 500
     """Held-out pictures."""
     empty: int = 100
     """Held-out pictures without any object."""
     shard: int = 100
-    """Pictures that share their props; a shard is made whole or not at all."""
+    """Pictures that share their props; a shard is written atomically."""
     seed: int = 0
     """Added to every seed."""
     jobs: int = 1
@@ -57,7 +56,7 @@ class Config:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Shard:
-    """One folder's worth of work."""
+    """Work item: the pictures of one folder."""
 
     split: str
     seed: int
@@ -67,7 +66,7 @@ class Shard:
 
     @property
     def folder(self) -> Path:
-        """Where its images go."""
+        """Folder of its images."""
         return self.out / "images" / self.split / str(self.seed)
 
 
@@ -86,19 +85,19 @@ def main(config: Config) -> None:
 
 
 def plan_shards(config: Config) -> list[Shard]:
-    """Return every shard that `config` asks for, those that exist included."""
+    """Return every shard of `config`, existing ones included."""
     shards = []
     for split, start in SPLITS.items():
         mix = replace(config.mix, **_CHANGES.get(split, {}))
-        wanted = getattr(config, split)
-        for number, first in enumerate(range(0, wanted, config.shard)):
-            count, seed = min(config.shard, wanted - first), start + config.seed + number
+        total = getattr(config, split)
+        for number, first in enumerate(range(0, total, config.shard)):
+            count, seed = min(config.shard, total - first), start + config.seed + number
             shards.append(Shard(split=split, seed=seed, count=count, mix=mix, out=config.out))
     return shards
 
 
 def make_shard(shard: Shard) -> None:
-    """Draw a shard's pictures and move them to their place when all are there."""
+    """Draw a shard's pictures and move them to their folder when complete."""
     from sim_twin.detection_data.scene_renderer import Stage
     from sim_twin.detection_data.scenes import draw_scene
 
@@ -129,7 +128,7 @@ def write_manifest(config: Config) -> None:
 
 
 def to_line(label: Label) -> str:
-    """Return a label as YOLO writes it: class number, then a polygon's corners as shares of width and height.
+    """Return a label in YOLO's format: class index, then a polygon's corners as ratios of width and height.
 
     Corners are the middles of the outermost pixels. Parts of one object, and only they, are joined by thin bridges;
     holes are filled.
@@ -141,16 +140,16 @@ def to_line(label: Label) -> str:
     parts = [outline.reshape(-1, 2) for outline in outlines if len(outline) > 2]
     parts = parts or [np.repeat(outlines[0].reshape(-1, 2), 3, axis=0)[:3]]
     corners = parts[0] if len(parts) == 1 else np.concatenate(merge_multi_segment([p.ravel().tolist() for p in parts]))
-    shares = (corners + 0.5) / [width, height]
-    return f"{CLASSES.index(label.name)} " + " ".join(f"{share:.5f}" for share in shares.ravel())
+    ratios = (corners + 0.5) / [width, height]
+    return f"{CLASSES.index(label.name)} " + " ".join(f"{ratio:.5f}" for ratio in ratios.ravel())
 
 
 def read_labels(path: Path, shape: tuple[int, int]) -> tuple[Label, ...]:
-    """Return the labels of a file that `to_line` wrote, for a picture of `shape` (H, W)."""
+    """Return the labels of a file of `to_line` lines, for a picture of `shape` (H, W)."""
     labels = []
     for line in path.read_text().splitlines():
-        number, *shares = line.split()
-        corners = np.array(shares, dtype=float).reshape(-1, 2) * shape[::-1]
+        number, *ratios = line.split()
+        corners = np.array(ratios, dtype=float).reshape(-1, 2) * shape[::-1]
         mask = np.zeros(shape, np.uint8)
         cv2.fillPoly(mask, [corners.astype(np.int32)], 1)
         labels.append(Label(name=CLASSES[int(number)], mask=mask.astype(bool)))

@@ -1,10 +1,10 @@
-"""Makes an environment of its own for one of NVIDIA's grasp generators, so that its packages never touch ours.
+"""Make a separate environment for one of NVIDIA's grasp generators, so that its packages never affect this project's.
 
     python -m scripts.train.make_generator_env graspgen      # research and evaluation only: NVIDIA's licence
     python -m scripts.train.make_generator_env graspgenx
 
 Afterwards `generator: graspgen`, `generator_process: own` and `generator_weights: FILE` in the configuration use it.
-Nothing else installs anything: a generator whose environment is missing says so and stops.
+Nothing else installs anything: a generator without its environment raises an error.
 """
 
 from __future__ import annotations
@@ -20,56 +20,59 @@ import tyro
 from rich.console import Console
 
 from hal.base.errors import Z1Error
-from models.nvidia.nvidia import ENVIRONMENTS, say_licence
+from models.nvidia.nvidia import ENVIRONMENTS_FOLDER, log_licence
 
 PACKAGES = {"graspgen": "eden-grasp-gen==0.1.7", "graspgenx": "eden-graspgenx==0.1.0"}
-"""What is installed for each; the adapters were tested with these."""
-_TORCH = "torch>=2.6"  # older ones run code out of a checkpoint
+"""Package of each generator, in the version that its adapter was tested with."""
+_TORCH = "torch>=2.6"  # older versions run code from a checkpoint
 
 
 class InstallError(Z1Error, RuntimeError):
-    """An environment that could not be made."""
+    """Environment that could not be made."""
 
     default_code = "install"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Config:
-    """Which environment."""
+    """Generator, and its build of PyTorch."""
 
     name: Annotated[Literal["graspgen", "graspgenx"], tyro.conf.Positional]
     """The generator."""
     torch_backend: str = "auto"
-    """Which PyTorch: `auto` fits this machine's GPU or none; `cpu`; empty takes PyPI's (4 GB, with CUDA)."""
+    """Build of PyTorch: `auto` fits this machine's GPU or none; `cpu`; empty takes PyPI's (4 GB, with CUDA)."""
 
 
 def main(config: Config) -> int:
     """Make the environment; 0 when the generator's package can be found in it."""
     console = Console(highlight=False)
-    say_licence(config.name)
+    log_licence(config.name)
     python = make_environment(config.name, find_uv(), config.torch_backend)
     console.print(f"{config.name} runs with {python}", soft_wrap=True)
     return 0
 
 
 def find_uv() -> Path:
-    """Return the installer that `./z1` uses.
+    """Return the path of the installer that `./z1` uses.
 
     Raises:
         InstallError: there is none.
     """
-    own = ENVIRONMENTS.parent / "uv" / "bin" / "uv"
+    own = ENVIRONMENTS_FOLDER.parent / "uv" / "bin" / "uv"
     found = shutil.which("uv") or (str(own) if own.is_file() else None)
     if found is None:
-        raise InstallError("the installer `uv` was not found; install it (https://docs.astral.sh/uv), then again.")
+        raise InstallError(
+            "the installer `uv` was not found; install it (https://docs.astral.sh/uv), then run this again.",
+            code="no_uv",
+        )
     return Path(found)
 
 
-def make_environment(name: str, uv: Path, torch_backend: str = "", root: Path = ENVIRONMENTS) -> Path:
-    """Make the environment of `name` under `root` anew and return its Python; one that fails leaves nothing.
+def make_environment(name: str, uv: Path, torch_backend: str = "", root: Path = ENVIRONMENTS_FOLDER) -> Path:
+    """Make a new environment of `name` under `root` and return its Python; a failed one is removed.
 
     Raises:
-        InstallError: `uv` failed; it has said why.
+        InstallError: `uv` failed; its output has the reason.
     """
     folder = root / name
     python = folder / "bin" / "python"
@@ -82,7 +85,7 @@ def make_environment(name: str, uv: Path, torch_backend: str = "", root: Path = 
     for step in steps:
         if subprocess.run(step, check=False).returncode:
             shutil.rmtree(folder, ignore_errors=True)
-            raise InstallError(f"`{' '.join(step)}` failed; its reason is above. Nothing was kept.")
+            raise InstallError(f"`{' '.join(step)}` failed; its reason is above. Nothing was kept.", code="uv_failed")
     return python
 
 

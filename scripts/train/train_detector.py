@@ -1,10 +1,10 @@
-"""Trains the detector on the CPU, from scratch, and writes its weights.
+"""Train the detector on the CPU, from scratch, and write its weights.
 
     python -m scripts.train.make_detection_dataset
-    python -m scripts.train.train_detector --processes 2   # goes on where it stopped
+    python -m scripts.train.train_detector --processes 2   # resumes
     python -m scripts.train.evaluate_detector              # writes models/weights/detector.json and a picture
 
-Checkpoints and logs lie in out/detector/run. Phases at growing picture sizes, see `models.detector.training`.
+Checkpoints and logs are in out/detector/run. Phases at growing picture sizes, see `models.detector.training`.
 """
 
 from __future__ import annotations
@@ -26,38 +26,40 @@ from sim_twin.detection_data.props import CLASSES
 
 @dataclass(frozen=True, kw_only=True)
 class Config:
-    """What to train on, and with how much of the machine."""
+    """Data, folders and resources of the training."""
 
     data: Path = Path("out/detector/data")
-    """Folder that `make_detection_dataset` wrote."""
+    """Folder of `make_detection_dataset`."""
     run: Path = Path("out/detector/run")
-    """Folder for checkpoints; give another one to start anew."""
+    """Folder for checkpoints; another one starts a new run."""
     threads: int = 1
     """Processor threads of each process."""
     processes: int = 1
-    """Processes that share each batch; two cores do more as two processes than as two threads."""
+    """Processes that share each batch; two processes on two cores are faster than two threads."""
     seed: int = 0
     """Of weights, order and augmentation."""
     weights: Path = WEIGHTS_FOLDER / "detector.npz"
-    """Where the weights go."""
+    """File of the weights."""
 
 
 def main(config: Config) -> None:
-    """Train what is not trained yet, and write the weights."""
+    """Train the phases that are not complete, and write the weights."""
     manifest = config.data / "data.yaml"
     if not manifest.is_file():
-        raise MissingFileError(f"{manifest} is missing; make it with `python -m scripts.train.make_detection_dataset`.")
+        raise MissingFileError(
+            f"{manifest} is missing; make it with `python -m scripts.train.make_detection_dataset`.", code="no_data"
+        )
     if config.processes > 1:
         _train_together(config)
     write_weights(config, train(config, manifest))
 
 
 def train(config: Config, manifest: Path) -> Path:
-    """Train the phases that are not done, on the pictures of `manifest`; return the last checkpoint."""
-    from models.detector.training import PHASES, train_phase
+    """Train the remaining phases on the pictures of `manifest`; return the last checkpoint."""
+    from models.detector.training import TRAINING_PHASES, train_phase
 
     checkpoint = None
-    for number, phase in enumerate(PHASES):
+    for number, phase in enumerate(TRAINING_PHASES):
         folder = (config.run / f"{number}_{phase.imgsz}").resolve()
         checkpoint = train_phase(
             phase, data=manifest, folder=folder, start=checkpoint, seed=config.seed, threads=config.threads
@@ -67,7 +69,7 @@ def train(config: Config, manifest: Path) -> Path:
 
 
 def _train_together(config: Config) -> None:
-    """Run `train` in several processes until all are done; when one fails the others are ended."""
+    """Run `train` in several processes; a failure of one ends the others."""
     from torch.multiprocessing.spawn import spawn
 
     with tempfile.TemporaryDirectory() as folder:
@@ -76,7 +78,7 @@ def _train_together(config: Config) -> None:
 
 def _train_as_peer(rank: int, config: Config, rendezvous: str) -> None:
     ranks = {"RANK": str(rank), "LOCAL_RANK": str(rank), "WORLD_SIZE": str(config.processes)}
-    os.environ |= ranks  # ultralytics reads them when it is imported, and deals the pictures out by them
+    os.environ |= ranks  # ultralytics reads them at import, and splits the pictures by them
     end_with_parent()
     from torch import distributed
 
@@ -86,7 +88,7 @@ def _train_as_peer(rank: int, config: Config, rendezvous: str) -> None:
 
 
 def end_with_parent() -> None:
-    """End this process when the one that started it is gone, even if that was killed."""
+    """End this process when its parent ends, even if that was killed."""
     parent = multiprocessing.parent_process()
     assert parent is not None
 
@@ -99,7 +101,7 @@ def end_with_parent() -> None:
 
 def write_weights(config: Config, checkpoint: Path) -> None:
     """Write the weights of `checkpoint`, their checksum and the recipe."""
-    from models.detector.training import ARCHITECTURE, AUGMENTATION, GAINS, PHASES, read_checkpoint
+    from models.detector.training import ARCHITECTURE, AUGMENTATION, GAINS, TRAINING_PHASES, read_checkpoint
     from models.detector.weights import save_detector
 
     digest = save_detector(config.weights, read_checkpoint(checkpoint), CLASSES)
@@ -107,7 +109,7 @@ def write_weights(config: Config, checkpoint: Path) -> None:
         "architecture": ARCHITECTURE,
         "seed": config.seed,
         "processes": config.processes,
-        "phases": [asdict(phase) for phase in PHASES],
+        "phases": [asdict(phase) for phase in TRAINING_PHASES],
     }
     recipe |= {"augmentation": AUGMENTATION, "gains": GAINS}
     recipe |= {"data": json.loads((config.data / "recipe.json").read_text())}

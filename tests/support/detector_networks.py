@@ -1,4 +1,4 @@
-"""Small help for tests of the detector: untrained networks that nevertheless see things, and something to look at."""
+"""Untrained networks with detections, and pictures, for tests of the detector."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ import cv2
 import numpy as np
 import torch
 
-from models.detector.weights import new_network, tame_ultralytics
+from models.detector.weights import disable_ultralytics_network, new_network
 
-tame_ultralytics()
+disable_ultralytics_network()
 
 
-def talkative(network, seed=0):
-    """Return `network` such that it finds a few dozen things in any image, each with a mask."""
+def randomise_head(network, seed=0):
+    """Return `network` with a few dozen detections in any image, each with a mask."""
     _settle(network)
     generator = torch.Generator().manual_seed(seed)
     head = network.model[-1]
@@ -20,14 +20,14 @@ def talkative(network, seed=0):
         for branch in [*head.cv2, *head.cv3, *getattr(head, "cv4", [])]:
             weight = 0.3 * torch.randn(branch[-1].weight.shape, generator=generator)
             branch[-1].weight.copy_(weight - weight.mean(dim=1, keepdim=True))
-        for branch in head.cv3:  # few shall be so sure that their order is a matter of the last bit
+        for branch in head.cv3:  # confidences near 1 would be ordered by the last bit
             branch[-1].weight.mul_(0.5)
             branch[-1].bias.fill_(-2.5)
     return network.eval()
 
 
 def _settle(network):
-    """Set the batch norms to what flows through them: in an untrained network all that is seen dies away otherwise."""
+    """Set the batch norms to the statistics of their inputs: otherwise an untrained network's signals vanish."""
     norms = [module for module in network.modules() if isinstance(module, torch.nn.BatchNorm2d)]
     momenta = [norm.momentum for norm in norms]
     for norm in norms:
@@ -40,21 +40,21 @@ def _settle(network):
 
 
 def segmenting(n_classes=3, seed=0):
-    """Return an untrained YOLOv8n-seg that finds things."""
+    """Return an untrained YOLOv8n-seg with detections."""
     torch.manual_seed(seed)
-    return talkative(new_network(n_classes), seed)
+    return randomise_head(new_network(n_classes), seed)
 
 
 def detecting(n_classes=3, seed=0):
-    """Return an untrained YOLOv8n that finds things."""
+    """Return an untrained YOLOv8n with detections."""
     from ultralytics.nn.tasks import DetectionModel
 
     torch.manual_seed(seed)
-    return talkative(DetectionModel("yolov8n.yaml", ch=3, nc=n_classes, verbose=False), seed)
+    return randomise_head(DetectionModel("yolov8n.yaml", ch=3, nc=n_classes, verbose=False), seed)
 
 
 def save_checkpoint(path, network, names, task):
-    """Write `network` as ultralytics writes a .pt."""
+    """Write `network` in ultralytics' .pt format."""
     network.names, network.task = dict(enumerate(names)), task
     torch.save({"model": network, "ema": None, "train_args": {"task": task}, "version": "8.4.0"}, path)
 

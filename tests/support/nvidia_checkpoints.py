@@ -1,4 +1,4 @@
-"""Small checkpoints of random numbers, written as GraspGen's and GraspGenX's trainings write them."""
+"""Small checkpoints of random numbers in the formats of GraspGen's and GraspGenX's trainings."""
 
 from __future__ import annotations
 

@@ -8,7 +8,7 @@ import pytest
 from hal.base import z1
 from hal.base.errors import ConfigError
 from models.diffusion.sampler import DiffusionSampler
-from models.diffusion.training.labels import GRIPPERS
+from models.diffusion.training.grippers import GRIPPERS
 from models.factory import make_generator
 from models.samplers.antipodal import AntipodalSampler
 from z1_runtime.config import RuntimeConfig, load_config

@@ -2,7 +2,7 @@
 
 Extrinsics that are off by 3 mm and 1° show an object 0.4 m away up to 10 mm off its place: too far for a grasp. The
 jaws' depth, registered to their meshes by iterative closest points (point to plane), recovers that place to 0.8 mm on
-average, 2.2 mm at worst (scripts/measure/measure_mount_sight.py: 21 frames in the twin), so that a camera that was
+average, 2.2 mm at worst (scripts/measure/measure_extrinsics_check.py: 21 frames in the twin), so that a camera that was
 knocked is compensated.
 """
 

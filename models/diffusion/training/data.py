@@ -13,19 +13,19 @@ from hal.base.errors import MissingFileError
 from models.diffusion.network import POSITION_SCALE_M
 from models.diffusion.training.solids import Solid
 
-_FRONT_WEIGHT = 3.0  # how much more often a grasp from straight behind the camera is drawn than one from the side
+_FRONT_WEIGHT = 3.0  # a grasp along the view ray is drawn 1 + 3 times as often as one from the side
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class GraspData:
-    """Shards put together: V views of S shapes."""
+    """Concatenated shards: V views of S shapes."""
 
     clouds: np.ndarray
     """(V, 512, 6) points [m] and normals in the view frame."""
     T_view_object: np.ndarray
     """(V, 4, 4)."""
     shape: np.ndarray
-    """(V,) which shape a view shows."""
+    """(V,) index of the shape in each view."""
     grasps: np.ndarray
     """(S, G, 4, 4) ground truth in the object frame; repeated where a shape has fewer."""
     widths_m: np.ndarray
@@ -38,7 +38,7 @@ class GraspData:
     """(S,) names."""
 
     def solid(self, view: int) -> Solid:
-        """Return the true object in a view."""
+        """Return the solid in a view."""
         s = self.shape[view]
         return Solid(family=str(self.family[s]), parts=self.parts[s], profiles=self.profiles[s])
 
@@ -59,7 +59,7 @@ def load_shards(folder: Path, limit: int | None = None) -> GraspData:
     """Return the shards in `folder` as one data set.
 
     Raises:
-        FileNotFoundError: there are none.
+        MissingFileError: there are none.
     """
     paths = sorted(p for p in folder.glob("*.npz") if not p.name.endswith(".partial.npz"))[:limit]
     if not paths:
@@ -74,8 +74,8 @@ def load_shards(folder: Path, limit: int | None = None) -> GraspData:
 def augment(cloud: Tensor, grasps: Tensor, symmetric: bool = True) -> tuple[Tensor, Tensor]:
     """Return clouds (B, N, 6) and grasps (B, K, 10) mirrored, turned, scaled and shifted together.
 
-    Hands look the same mirrored along x, so both image axes may be mirrored; the turn is about the view ray. Those that
-    are `symmetric` along y too, as a parallel jaw is, may also be turned over.
+    Grippers are symmetric along x, so both image axes may be mirrored; the turn is about the view ray. Those that are
+    `symmetric` along y too, as parallel grippers are, may also be turned over.
     """
     batch = len(cloud)
     angle = 0.15 * torch.randn(batch)

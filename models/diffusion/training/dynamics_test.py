@@ -1,8 +1,8 @@
-"""Grasps tried in dynamics: a jaw closes on the object with force and is shaken; the object stays or is lost.
+"""Dynamics test of grasps in MuJoCo: the gripper closes with force and is accelerated; the object stays or is lost.
 
-The exact check of `labels.py` is geometry: no mass, no slip, no turning. Here MuJoCo decides. Fingers, mass, force and
-friction are those of the hand and of a light household thing, and the shaking is done in the hand's own frame: a hand
-that is thrown about feels the same as one held still while gravity changes its direction.
+The exact check of `labels.py` is geometry: no mass, no slip, no turning. Fingers, mass, force and friction here are
+those of the gripper and of a light household object. The test runs in the gripper's own frame: an accelerated gripper
+is equivalent to one at rest under gravity in another direction.
 """
 
 from __future__ import annotations
@@ -13,24 +13,25 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from models.diffusion.training.convex import turned_pieces
-from models.diffusion.training.labels import GraspCheck, GripperSpec
+from models.diffusion.training.convex import split_turned_solid
+from models.diffusion.training.grippers import ParallelGripperSpec
+from models.diffusion.training.labels import GraspCheck
 from models.diffusion.training.solids import BOX, CAPSULE, TORUS, Solid
 
 if TYPE_CHECKING:
     import mujoco
 
-_TIMESTEP_S = 0.002
+_TIMESTEP_S = 0.002  # MuJoCo's default
 _RING_PIECES = 16
 _FINGER_MASS_KG = 0.1
 _FINGER_BIT, _OBJECT_BIT = 1, 2
-_FINGERS = (1, 2)  # numbers of their geoms; the palm, of the world, has 0, the object the rest
+_FINGERS = (1, 2)  # geom indices; the palm, part of the world, has 0, the object the rest
 _START_GAP_M = 0.002
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ShakeConfig:
-    """How hard the jaw holds and how it is shaken."""
+class DynamicsTestConfig:
+    """Forces, times and masses of the dynamics test."""
 
     force_n: float = 40.0
     """Of each finger [N]; a Robotiq 2F-140 gives 10 to 125 N (its datasheet)."""
@@ -38,60 +39,64 @@ class ShakeConfig:
     """Of each finger until it touches [m/s]; a 2F-140 closes with 0.015 to 0.125 m/s each (its datasheet)."""
     settle_s: float = 0.3
     """Closing and coming to rest, without gravity [s]."""
-    shake_s: float = 0.16
-    """Time of each direction [s]."""
+    hold_s: float = 0.16
+    """Duration of each acceleration [s]."""
     acceleration_m_s2: float = 20.0
-    """Felt in each direction, twice gravity [m/s²]."""
+    """Acceleration in each direction, twice gravity [m/s²]."""
     density_kg_m3: float = 500.0
     """Of the object [kg/m³]; packed food and half-full bottles have 400 to 700."""
     mass_kg: tuple[float, float] = (0.05, 0.5)
-    """Least and greatest mass of an object [kg]."""
+    """Minimum and maximum mass of an object [kg]."""
 
 
-def shake_grasps(
-    solid: Solid, T: np.ndarray, check: GraspCheck, gripper: GripperSpec, config: ShakeConfig | None = None
+def simulate_grasps(
+    solid: Solid,
+    T: np.ndarray,
+    check: GraspCheck,
+    gripper: ParallelGripperSpec,
+    config: DynamicsTestConfig | None = None,
 ) -> np.ndarray:
-    """Return which grasps `T` (N, 4, 4) in the solid's frame keep hold of it, (N,) bool.
+    """Return the mask (N,) of the grasps `T` (N, 4, 4) in the solid's frame that hold it in simulation.
 
-    The pads close on the object, then it is thrown to and fro along all three axes of the hand. It is held if both
-    fingers still touch it after each throw. A grasp whose pads close on nothing, or whose open hand is not free, is
-    not tried: it does not hold.
+    The pads close on the object, then it is accelerated both ways along all three axes of the gripper. It is held if
+    both fingers still touch it after each. A grasp whose pads close on nothing, or whose open gripper is not free, is
+    not simulated: it does not hold.
 
     Args:
         solid: the object.
         T: poses in the grasp frame (z approach, y closing).
-        check: what `check_grasps` says of the same grasps; it tells where the fingers start.
-        gripper: the hand; two fingers that close alike, as those of a 2F-140 do.
-        config: forces and times.
+        check: result of `check_grasps` for the same grasps; it gives the fingers' start.
+        gripper: two fingers that close symmetrically, as those of a 2F-140 do.
+        config: forces, times and masses.
     """
     import mujoco
 
-    config = config or ShakeConfig()
+    config = config or DynamicsTestConfig()
     held = np.zeros(len(T), dtype=bool)
-    tried = np.flatnonzero(np.isfinite(check.widths_m))
-    if not len(tried):
+    simulated = np.flatnonzero(np.isfinite(check.widths_m))
+    if not len(simulated):
         return held
     model = _build_model(solid, gripper, config)
     data = mujoco.MjData(model)
-    for index in tried:
+    for index in simulated:
         mujoco.mj_resetData(model, data)
-        # Both fingers start a little outside the contact that is further from the middle.
+        # Both fingers start just outside the contact that is further from the middle.
         opening = 0.5 * check.widths_m[index] + abs(check.offsets_m[index]) + _START_GAP_M
         data.qpos[:2] = opening
         data.ctrl[:2] = config.force_n
         T_grasp_object = np.linalg.inv(T[index])
         data.qpos[2:5] = T_grasp_object[:3, 3]
         mujoco.mju_mat2Quat(data.qpos[5:9], T_grasp_object[:3, :3].ravel())
-        held[index] = _survives(model, data, config)
+        held[index] = _is_held(model, data, config)
     return held
 
 
-def _survives(model: mujoco.MjModel, data: mujoco.MjData, config: ShakeConfig) -> bool:
+def _is_held(model: mujoco.MjModel, data: mujoco.MjData, config: DynamicsTestConfig) -> bool:
     import mujoco
 
     model.opt.gravity[:] = 0.0
     mujoco.mj_step(model, data, round(config.settle_s / _TIMESTEP_S))
-    steps = round(config.shake_s / _TIMESTEP_S)
+    steps = round(config.hold_s / _TIMESTEP_S)
     for axis in (2, 0, 1):
         for sign in (-1.0, 1.0):
             if not _both_touch(model, data):
@@ -108,8 +113,8 @@ def _both_touch(model: mujoco.MjModel, data: mujoco.MjData) -> bool:
     return touched.issuperset(_FINGERS)
 
 
-def _build_model(solid: Solid, gripper: GripperSpec, config: ShakeConfig) -> mujoco.MjModel:
-    """Return the hand in its own frame and the object as a free body; positions: two openings [m], then its pose."""
+def _build_model(solid: Solid, gripper: ParallelGripperSpec, config: DynamicsTestConfig) -> mujoco.MjModel:
+    """Return the gripper in its own frame and the object as a free body; qpos: two openings [m], then its pose."""
     import mujoco
 
     spec = mujoco.MjSpec()
@@ -117,14 +122,14 @@ def _build_model(solid: Solid, gripper: GripperSpec, config: ShakeConfig) -> muj
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.impratio = 10.0
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    _add_hand(spec, gripper, config)
+    _add_gripper(spec, gripper, config)
     body = spec.worldbody.add_body(name="object")
     body.add_freejoint()
-    seen = set()
+    added = set()
     for row, outline in zip(solid.parts, solid.profiles, strict=True):
-        if row.tobytes() + outline.tobytes() not in seen:  # data sets give a part twice, which would weigh twice
+        if row.tobytes() + outline.tobytes() not in added:  # shards repeat parts, which would count the mass twice
             _add_part(spec, body, row, outline)
-            seen.add(row.tobytes() + outline.tobytes())
+            added.add(row.tobytes() + outline.tobytes())
     for geom in body.geoms:
         geom.density = config.density_kg_m3
         geom.contype, geom.conaffinity = _OBJECT_BIT, _FINGER_BIT
@@ -138,8 +143,8 @@ def _build_model(solid: Solid, gripper: GripperSpec, config: ShakeConfig) -> muj
     return model
 
 
-def _add_hand(spec: mujoco.MjSpec, gripper: GripperSpec, config: ShakeConfig) -> None:
-    """Add two fingers that slide along ±y, coupled so that they close alike, and the palm they stand on."""
+def _add_gripper(spec: mujoco.MjSpec, gripper: ParallelGripperSpec, config: DynamicsTestConfig) -> None:
+    """Add two fingers that slide along ±y, coupled to close symmetrically, and the palm behind them."""
     import mujoco
 
     size = [gripper.finger_width_m / 2.0, gripper.finger_thickness_m / 2.0, gripper.finger_length_m / 2.0]
@@ -183,8 +188,8 @@ def _add_part(spec: mujoco.MjSpec, body: mujoco.MjsBody, row: np.ndarray, outlin
     if kind == BOX:
         body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=sizes, pos=origin, quat=quat)
     elif kind == CAPSULE:
-        round_one = mujoco.mjtGeom.mjGEOM_CAPSULE if sizes[1] > 0.0 else mujoco.mjtGeom.mjGEOM_SPHERE
-        body.add_geom(type=round_one, size=[sizes[0], sizes[1], 0.0], pos=origin, quat=quat)
+        shape = mujoco.mjtGeom.mjGEOM_CAPSULE if sizes[1] > 0.0 else mujoco.mjtGeom.mjGEOM_SPHERE
+        body.add_geom(type=shape, size=[sizes[0], sizes[1], 0.0], pos=origin, quat=quat)
     elif kind == TORUS:
         angle = 2.0 * np.pi * np.arange(_RING_PIECES + 1) / _RING_PIECES
         ring = np.column_stack([sizes[0] * np.cos(angle), np.zeros(len(angle)), sizes[0] * np.sin(angle)])
@@ -192,7 +197,7 @@ def _add_part(spec: mujoco.MjSpec, body: mujoco.MjsBody, row: np.ndarray, outlin
         for start, end in pairwise(ring):
             body.add_geom(type=mujoco.mjtGeom.mjGEOM_CAPSULE, fromto=[*start, *end], size=[sizes[1], 0.0, 0.0])
     else:
-        for piece in turned_pieces(outline[: int(row[5])], row[1]):
+        for piece in split_turned_solid(outline[: int(row[5])], row[1]):
             mesh = spec.add_mesh(name=f"piece {len(spec.meshes)}", inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX)
             mesh.uservert = piece.ravel()
             body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh.name, pos=origin, quat=quat)

@@ -1,4 +1,4 @@
-"""The generator's own samples with verdicts: what its discriminator learns from (on-generator training)."""
+"""Labelled samples of the generator, the training data of its discriminator (on-generator training)."""
 
 from __future__ import annotations
 
@@ -13,59 +13,61 @@ from torch import Tensor
 
 from models.diffusion.network import N_COORDINATES, Denoiser, decode_grasps, encode_grasps
 from models.diffusion.training.data import GraspData
-from models.diffusion.training.dynamics_test import shake_grasps
-from models.diffusion.training.labels import GripperSpec, Hand, check_grasps
+from models.diffusion.training.dynamics_test import simulate_grasps
+from models.diffusion.training.grippers import AnyGripper, ParallelGripperSpec
+from models.diffusion.training.labels import check_grasps
 
-Progress = Callable[[int, float], None]
+ProgressCallback = Callable[[int, float], None]
+"""Called with the number of items done and the current value (a loss, or a ratio)."""
 _BATCH = 16
 _CHUNK = 10 * _BATCH  # views in a file
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class JudgingConfig:
-    """How many grasps are judged, and how."""
+class LabellingConfig:
+    """Numbers of labelled grasps, and their labels."""
 
     views: int = 10000
     """Views whose samples are labelled."""
     samples: int = 64
-    """Of the generator's own, on each."""
+    """Samples of the generator on each."""
     perturbed: int = 32
-    """Ground truth knocked aside by up to 20 mm and some 20°, on each."""
+    """Ground-truth grasps perturbed by up to 20 mm and some 20°, on each."""
     steps: int = 5
-    """Denoising steps with which the samples are made."""
-    shaken_share: float = 0.01
-    """Share of what the exact check lets pass that is also tried in dynamics; what is lost there counts as invalid."""
+    """Denoising steps of the samples."""
+    simulated_fraction: float = 0.01
+    """Ratio of the valid grasps that are also simulated; those lost there count as invalid."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class JudgedSamples:
-    """Grasps with their verdicts."""
+class LabelledSamples:
+    """Grasps with their labels."""
 
     views: np.ndarray
     """(J,) indices of the views."""
     grasps: Tensor
     """(J, K, 10)."""
     valid: Tensor
-    """(J, K) 1.0 where the check passed, and the shaking for those that were shaken."""
-    shaken: int
-    """Grasps that were tried in dynamics."""
+    """(J, K) 1.0 where the exact check passed, and the dynamics test of the simulated ones."""
+    simulated: int
+    """Number of grasps that were simulated."""
     lost: int
-    """Those of them that did not hold."""
+    """Number of those that did not hold."""
 
 
-def judge_samples(
+def label_samples(
     generator: Denoiser,
     data: GraspData,
-    gripper: Hand,
+    gripper: AnyGripper,
     *,
-    config: JudgingConfig,
+    config: LabellingConfig,
     seed: int,
     folder: Path,
-    progress: Progress,
-) -> JudgedSamples:
-    """Return the generator's own samples and perturbed ground truth with the verdicts of check and shaking.
+    progress: ProgressCallback,
+) -> LabelledSamples:
+    """Return the generator's samples and perturbed ground truth, labelled by exact check and dynamics test.
 
-    Chunks are kept in `folder`; those of this very generator are not made again.
+    Chunks are kept in `folder`; those of the same generator and configuration are reused.
     """
     folder.mkdir(parents=True, exist_ok=True)
     digest = _digest(generator, config)
@@ -75,57 +77,57 @@ def judge_samples(
         path = folder / f"{start:05d}.npz"
         chunk = _load(path, digest)
         if chunk is None:
-            chunk = _judge_chunk(generator, data, gripper, views[start : start + _CHUNK], config, (seed, 2, start))
+            chunk = _label_chunk(generator, data, gripper, views[start : start + _CHUNK], config, (seed, 2, start))
             partial = path.with_suffix(".partial.npz")
             np.savez(partial, allow_pickle=False, digest=np.array(digest), **chunk)
             partial.replace(path)
         chunks.append(chunk)
         progress(start + len(chunk["valid"]), float(chunk["valid"].mean()))
     joined = {key: np.concatenate([chunk[key] for chunk in chunks]) for key in chunks[0]}
-    return JudgedSamples(
+    return LabelledSamples(
         views=views,
         grasps=torch.from_numpy(joined["grasps"]),
         valid=torch.from_numpy(joined["valid"].astype(np.float32)),
-        shaken=int(joined["shaken"].sum()),
+        simulated=int(joined["simulated"].sum()),
         lost=int(joined["lost"].sum()),
     )
 
 
-def _judge_chunk(  # noqa: PLR0917
+def _label_chunk(  # noqa: PLR0917
     generator: Denoiser,
     data: GraspData,
-    gripper: Hand,
+    gripper: AnyGripper,
     views: np.ndarray,
-    config: JudgingConfig,
+    config: LabellingConfig,
     seed: tuple[int, ...],
 ) -> dict[str, np.ndarray]:
     rng = np.random.default_rng(seed)
     torch.manual_seed(int(rng.integers(2**31)))
-    rows: dict[str, list[np.ndarray]] = {"grasps": [], "valid": [], "shaken": [], "lost": []}
+    rows: dict[str, list[np.ndarray]] = {"grasps": [], "valid": [], "simulated": [], "lost": []}
     for start in range(0, len(views), _BATCH):
         part = views[start : start + _BATCH]
         cloud = torch.from_numpy(data.clouds[part].astype(np.float32))
         with torch.autocast("cpu", torch.bfloat16):
             own = generator.sample(cloud, torch.randn(len(part), config.samples, N_COORDINATES), config.steps)
         T, widths = data.draw_grasps(part, config.perturbed, rng)
-        v = torch.cat([own.float(), _perturbed(encode_grasps(torch.from_numpy(T), torch.from_numpy(widths)))], dim=1)
+        v = torch.cat([own.float(), _perturb(encode_grasps(torch.from_numpy(T), torch.from_numpy(widths)))], dim=1)
         T_view, widths_view = (a.numpy() for a in decode_grasps(v.double()))
         for row, view in enumerate(part):
             T_object = np.linalg.inv(data.T_view_object[view].astype(np.float64)) @ T_view[row]
             solid = data.solid(int(view))
             check = check_grasps(solid, T_object, gripper, widths_view[row])
-            shaken = check.valid & (rng.random(len(T_object)) < config.shaken_share)
-            lost = np.zeros_like(shaken)
-            if isinstance(gripper, GripperSpec):  # a beak's jaws are not modelled in dynamics
-                lost[shaken] = ~shake_grasps(solid, T_object[shaken], check[shaken], gripper)
-                rows["shaken"].append(shaken)
+            simulated = check.valid & (rng.random(len(T_object)) < config.simulated_fraction)
+            lost = np.zeros_like(simulated)
+            if isinstance(gripper, ParallelGripperSpec):  # the dynamics test models parallel fingers only
+                lost[simulated] = ~simulate_grasps(solid, T_object[simulated], check[simulated], gripper)
+                rows["simulated"].append(simulated)
                 rows["lost"].append(lost)
             rows["valid"].append(check.valid & ~lost)
         rows["grasps"].append(v.numpy())
     nothing = np.zeros((0, config.samples + config.perturbed), dtype=bool)
     return {
         "grasps": np.concatenate(rows["grasps"]),
-        **{key: np.stack(rows[key]) if rows[key] else nothing for key in ("valid", "shaken", "lost")},
+        **{key: np.stack(rows[key]) if rows[key] else nothing for key in ("valid", "simulated", "lost")},
     }
 
 
@@ -138,16 +140,16 @@ def _load(path: Path, digest: str) -> dict[str, np.ndarray] | None:
         return {key: file[key] for key in file.files if key != "digest"}
 
 
-def _digest(generator: Denoiser, config: JudgingConfig) -> str:
-    """Return what tells one generator and way of judging from another."""
-    seen = hashlib.sha256(repr(config).encode())
+def _digest(generator: Denoiser, config: LabellingConfig) -> str:
+    """Return the hash of a generator and its labelling configuration."""
+    digest = hashlib.sha256(repr(config).encode())
     for value in generator.state_dict().values():
-        seen.update(value.numpy().tobytes())
-    return seen.hexdigest()
+        digest.update(value.numpy().tobytes())
+    return digest.hexdigest()
 
 
-def _perturbed(v: Tensor) -> Tensor:
-    """Return grasps (B, K, 10) each knocked aside by its own random amount."""
+def _perturb(v: Tensor) -> Tensor:
+    """Return grasps (B, K, 10) each perturbed by its own random amount."""
     amount = torch.rand(*v.shape[:2], 1)
     scale = torch.tensor([0.4] * 3 + [0.35] * 6 + [0.2])
     return v + amount * scale * torch.randn_like(v)

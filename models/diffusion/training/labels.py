@@ -1,93 +1,33 @@
-"""What counts as a grasp: hands as data, ground-truth grasps of a solid, and an exact check of any grasp."""
+"""Labels of grasps: ground-truth grasps of a solid, and an exact check of any grasp on it."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 from numba import njit
 
 from hal.base.errors import InvalidValueError
+from models.diffusion.training.grippers import AnyGripper
 from models.diffusion.training.solids import Solid, distance_at, normal_at, trace
-from models.diffusion.training.z1_gripper import LAY, BeakSpec, check_beak
+from models.diffusion.training.z1_gripper import GRIPPER_FIT, Z1GripperSpec, check_z1_grasps
 
-_LAY = np.array(LAY)
-_SAME_CONTACT_M = 0.0015  # a pad lies on all points it would reach within this distance
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class GripperSpec:
-    """A parallel jaw in the grasp frame: z approach, y closing, origin midway between the open fingertips."""
-
-    name: str
-    max_width_m: float
-    """Opening with which the hand approaches [m]."""
-    min_width_m: float = 0.004
-    """Narrowest object that ground truth closes on [m]."""
-    finger_length_m: float = 0.07
-    """From the palm to the fingertips [m]."""
-    finger_thickness_m: float = 0.012
-    """Of one finger, along y [m]."""
-    finger_width_m: float = 0.022
-    """Of one finger, along x [m]."""
-    palm_width_m: float = 0.06
-    """Of the palm, along x [m]."""
-    palm_length_m: float = 0.08
-    """How far the hand reaches back behind the fingers [m]."""
-    min_depth_m: float = 0.004
-    """Least reach of the fingertips past the contacts in ground truth [m]."""
-    max_depth_m: float = 0.02
-    """Greatest reach of the fingertips past the contacts in ground truth [m]."""
-    friction: float = 0.5
-    """Coulomb coefficient that a valid grasp may count on."""
-    symmetric: ClassVar[bool] = True
-    """Whether the hand looks the same turned over."""
-
-    def __post_init__(self) -> None:
-        if not 0.0 < self.min_width_m < self.max_width_m:
-            raise InvalidValueError(f"Want 0 < min_width_m < max_width_m; got {self.min_width_m}, {self.max_width_m}.")
-        if not 0.0 <= self.min_depth_m <= self.max_depth_m < self.finger_length_m:
-            raise InvalidValueError(f"Want 0 ≤ min_depth_m ≤ max_depth_m < finger_length_m; got {self}.")
-
-    def body_points(self) -> np.ndarray:
-        """Return points (K, 3) on the open hand's fingers and palm; they are what must not touch an object."""
-        inner, outer = self.max_width_m / 2.0, self.max_width_m / 2.0 + self.finger_thickness_m
-        half = self.finger_width_m / 2.0
-        z_finger = np.linspace(-self.finger_length_m, 0.0, 11)
-        fingers = [_grid([-half, 0.0, half], [s * inner, s * outer], z_finger) for s in (-1.0, 1.0)]
-        z_palm = -self.finger_length_m - np.array([0.0, 0.3, 1.0]) * self.palm_length_m
-        palm_half = self.palm_width_m / 2.0
-        palm = _grid(np.linspace(-palm_half, palm_half, 5), np.linspace(-outer, outer, 17), z_palm)
-        return np.concatenate([*fingers, palm])
-
-    def pad_points(self) -> np.ndarray:
-        """Return points (K, 2) x, z on a finger's inner face, whence it closes."""
-        half = 0.8 * self.finger_width_m / 2.0
-        grid = _grid([-half, 0.0, half], [0.0], np.linspace(-0.7 * self.finger_length_m, -0.001, 8))
-        return np.ascontiguousarray(grid[:, [0, 2]])
-
-
-Hand = GripperSpec | BeakSpec
-GRIPPERS: dict[str, Hand] = {
-    "agnostic": GripperSpec(name="agnostic", max_width_m=0.136),
-    "z1": BeakSpec(name="z1"),
-}
-"""Hands that weights can be trained for; `agnostic` has the opening of a Robotiq 2F-140 (its datasheet)."""
+_GRIPPER_FIT = np.array(GRIPPER_FIT)
+_SAME_CONTACT_M = 0.0015  # a pad touches all points that it would reach within this distance
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class GraspCheck:
-    """What the exact solid says of some grasps."""
+    """Result of the exact check of some grasps."""
 
     free: np.ndarray
-    """(N,) bool, the open hand touches nothing."""
+    """(N,) bool, the open gripper touches nothing."""
     antipodal: np.ndarray
-    """(N,) bool, both pads of a free hand touch, each within the friction cone."""
+    """(N,) bool, both pads of a free gripper touch, each within the friction cone."""
     widths_m: np.ndarray
-    """(N,) distance between the contacts [m]; NaN where a pad touches nothing or the hand is not free."""
+    """(N,) distance between the contacts [m]; NaN where a pad touches nothing or the gripper is not free."""
     offsets_m: np.ndarray
-    """(N,) how far the contacts' middle lies from the grasp's origin along y [m]; NaN as above."""
+    """(N,) position of the contacts' middle from the grasp's origin along y [m]; NaN as above."""
 
     @property
     def valid(self) -> np.ndarray:
@@ -95,7 +35,7 @@ class GraspCheck:
         return self.free & self.antipodal
 
     def __getitem__(self, index: np.ndarray | slice) -> GraspCheck:
-        """Return what is said of the grasps that `index` picks."""
+        """Return the results of the grasps at `index`."""
         return GraspCheck(
             free=self.free[index],
             antipodal=self.antipodal[index],
@@ -107,37 +47,40 @@ class GraspCheck:
 def check_grasps(
     solid: Solid,
     T: np.ndarray,
-    gripper: Hand,
+    gripper: AnyGripper,
     widths_m: np.ndarray | None = None,
     *,
     clearance_m: float = 0.0,
     cone_rad: float | None = None,
 ) -> GraspCheck:
-    """Return whether the grasps `T` (N, 4, 4) in the solid's frame hold.
+    """Check whether the grasps `T` (N, 4, 4) in the solid's frame hold.
 
     Args:
         solid: the true object.
         T: poses in the grasp frame (z approach, y closing).
-        gripper: the hand.
-        widths_m: (N,) what is to be held is said to be this wide; a beak is laid around it, a parallel jaw needs none.
-        clearance_m: free space that the open hand needs.
-        cone_rad: greatest angle between closing line and contact normal; the gripper's friction cone if None.
+        gripper: sizes and friction.
+        widths_m: (N,) stated widths, around which the Z1 gripper is fitted; not used for a parallel gripper.
+        clearance_m: free space around the open gripper.
+        cone_rad: maximum angle between closing line and contact normal; the gripper's friction cone if None.
 
     Raises:
-        ValueError: the hand is a beak, and no widths are given.
+        InvalidValueError: the gripper is the Z1's, and no widths are given.
     """
     cone = float(np.arctan(gripper.friction)) if cone_rad is None else cone_rad
     T = np.ascontiguousarray(T, dtype=np.float64)
     shape = (solid.parts, solid.profiles, T)
-    if isinstance(gripper, BeakSpec):
+    if isinstance(gripper, Z1GripperSpec):
         if widths_m is None:
             raise InvalidValueError(
-                f"Grasps of the hand {gripper.name!r} are checked with their widths; give widths_m (N,)."
+                f"Grasps of the gripper {gripper.name!r} are checked with their widths; give widths_m (N,).",
+                code="widths_missing",
             )
         widths = np.ascontiguousarray(np.broadcast_to(widths_m, len(T)), dtype=np.float64)
-        body = (gripper.fixed_points, gripper.turning_points)
-        faces = (gripper.fixed_face_points, gripper.turning_face_points)
-        free, antipodal, widths, offsets = check_beak(*shape, widths, *body, *faces, _LAY, clearance_m, np.cos(cone))
+        body = (gripper.stationary_points, gripper.moving_points)
+        faces = (gripper.stationary_face_points, gripper.moving_face_points)
+        free, antipodal, widths, offsets = check_z1_grasps(
+            *shape, widths, *body, *faces, _GRIPPER_FIT, clearance_m, np.cos(cone)
+        )
     else:
         body = (gripper.body_points(), gripper.pad_points(), gripper.max_width_m / 2.0)
         free, antipodal, widths, offsets = _check(*shape, *body, clearance_m, np.cos(cone))
@@ -145,16 +88,16 @@ def check_grasps(
 
 
 def find_grasps(
-    solid: Solid, gripper: Hand, rng: np.random.Generator, n_contacts: int = 900, n_turns: int = 4
+    solid: Solid, gripper: AnyGripper, rng: np.random.Generator, n_contacts: int = 900, n_turns: int = 4
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return ground-truth grasps (N, 4, 4) of `solid` from all sides and their widths (N,) [m].
 
     Contacts are drawn over the surface, paired along nearly their normal, and approached from all directions square
-    to the closing line. Ground truth keeps 3 mm of clearance and a cone of 17°, well within what `check_grasps` allows,
-    so that a generator may miss it by a little.
+    to the closing line. Ground truth keeps 3 mm of clearance and a cone of 17°, well within the limits of
+    `check_grasps`, so that a generator's small errors still give a valid grasp.
     """
     first, closing = _draw_contacts(solid, n_contacts, rng)
-    # The far finger starts somewhere outside, not beyond everything: so it also closes on walls and single branches.
+    # The far finger starts at any distance outside, not beyond the object: so it also closes on walls and branches.
     start = rng.uniform(0.02, gripper.max_width_m, len(first))
     far = first + start[:, None] * closing
     outside = solid.distance(far) > 0.002
@@ -185,10 +128,6 @@ def _draw_contacts(solid: Solid, count: int, rng: np.random.Generator) -> tuple[
     return points, _unit(-normals + rng.normal(size=normals.shape) * np.tan(0.1))
 
 
-def _grid(x, y, z) -> np.ndarray:
-    return np.stack(np.meshgrid(x, y, z, indexing="ij"), axis=-1).reshape(-1, 3).astype(np.float64)
-
-
 def _unit(v: np.ndarray) -> np.ndarray:
     return v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-12)
 
@@ -207,7 +146,7 @@ def _is_free(parts, profiles, T, body, clearance):
 
 @njit(cache=True)
 def _close_finger(parts, profiles, T, pads, side, half):  # noqa: PLR0917 (compiled functions take no keywords)
-    """Return how far one finger closes until it touches, and the cosine of its contact's normal to the closing line."""
+    """Return a finger's travel until it touches, and the cosine of its contact's normal to the closing line."""
     cx, cy, cz = -side * T[0, 1], -side * T[1, 1], -side * T[2, 1]
     reach = np.empty(len(pads))
     origins = np.empty((len(pads), 3))

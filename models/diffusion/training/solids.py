@@ -12,7 +12,7 @@ from hal.base.errors import InvalidValueError
 BOX, CAPSULE, TORUS, LATHE = range(4)
 _ROW = 18  # kind, rounding, three sizes, profile length, nine of R, three of the origin
 _MAX_PROFILE = 24
-_HIT_M = 2e-4
+_HIT_M = 2e-4  # nearer than this a ray has touched; the thinnest part, a cup's wall, has 2 mm
 _GRADIENT_STEP_M = 4e-4
 
 
@@ -21,9 +21,9 @@ class Solid:
     """A union of parts; distances are exact outside, and negative inside."""
 
     family: str
-    """What kind of thing it is, such as `bottle`."""
+    """Name of its kind, such as `bottle`."""
     parts: np.ndarray
-    """(P, 18) one row a part."""
+    """(P, 18) one row for each part."""
     profiles: np.ndarray
     """(P, 24, 2) radius and height of the turned parts' outlines [m]."""
 
@@ -36,7 +36,7 @@ class Solid:
         return _normals(self.parts, self.profiles, np.ascontiguousarray(points, dtype=np.float64))
 
     def cast(self, origins: np.ndarray, directions: np.ndarray, reach_m: float) -> np.ndarray:
-        """Return how far (N,) [m] rays run until they touch the surface from outside; inf beyond `reach_m`."""
+        """Return the lengths (N,) [m] of rays until they touch the surface from outside; inf beyond `reach_m`."""
         return _cast(
             self.parts,
             self.profiles,
@@ -46,12 +46,12 @@ class Solid:
         )
 
     def enclosing_radius(self) -> float:
-        """Return the radius of a sphere about the frame's origin that holds the solid [m]."""
+        """Return the radius of a sphere about the frame's origin that encloses the solid [m]."""
         rng = np.random.default_rng(0)
         out = rng.normal(size=(400, 3))
         out /= np.linalg.norm(out, axis=1, keepdims=True)
         far = 0.6
-        # Seen from every side at a distance, the nearest point of the surface is never further out than the radius.
+        # From any direction, the distance of a far point to the surface is at least its distance minus the radius.
         return float(np.max(far - self.distance(out * far)) + 0.002)
 
 
@@ -72,7 +72,7 @@ def make_part(
         sizes: as `kind` says [m].
         profile: closed outline of (radius, height), starting and ending on the axis unless hollow [m].
         rounding_m: radius of the edges; the part keeps its sizes.
-        origin: where the part stands in the solid's frame [m].
+        origin: of the part in the solid's frame [m].
         rotation: (3, 3) part to solid.
     """
     row = np.zeros(_ROW)
@@ -81,7 +81,9 @@ def make_part(
     outline = np.zeros((_MAX_PROFILE, 2))
     if profile is not None:
         if len(profile) > _MAX_PROFILE:
-            raise InvalidValueError(f"A profile has {len(profile)} corners; allowed are {_MAX_PROFILE}.")
+            raise InvalidValueError(
+                f"A profile has {len(profile)} corners; allowed are {_MAX_PROFILE}.", code="profile_length"
+            )
         outline[: len(profile)] = profile
         row[5] = len(profile)
     row[6:15] = (np.eye(3) if rotation is None else rotation).ravel()
@@ -151,7 +153,7 @@ def distance_at(parts, profiles, px, py, pz):
 
 @njit(cache=True, fastmath=True)
 def trace(parts, profiles, ox, oy, oz, dx, dy, dz, reach):  # noqa: PLR0917 (compiled functions take no keywords)
-    """Return how far a ray runs until it touches the surface (sphere tracing); inf beyond `reach`."""
+    """Return the length of a ray until it touches the surface (sphere tracing); inf beyond `reach`."""
     t = 0.0
     for _ in range(80):
         d = distance_at(parts, profiles, ox + t * dx, oy + t * dy, oz + t * dz)

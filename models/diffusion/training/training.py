@@ -1,4 +1,4 @@
-"""Trains the generator, and the discriminator on what was said of the generator's samples."""
+"""Training of the generator, and of the discriminator on labelled samples of the generator."""
 
 from __future__ import annotations
 
@@ -16,16 +16,14 @@ from torch.nn import functional as F
 
 from models.diffusion.network import Denoiser, Discriminator, encode_grasps
 from models.diffusion.training.data import GraspData, augment
-from models.diffusion.training.labelled_samples import JudgedSamples, JudgingConfig
+from models.diffusion.training.labelled_samples import LabelledSamples, LabellingConfig, ProgressCallback
 
-Network = TypeVar("Network", bound=nn.Module)
-Progress = Callable[[int, float], None]
-"""Called with the iteration and the loss."""
+ModuleT = TypeVar("ModuleT", bound=nn.Module)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrainingConfig:
-    """How long and how fast; the recipe that is written beside the weights."""
+    """Iterations, rates and batches, as written into the weights' recipe."""
 
     generator_iterations: int = 15000
     generator_rate: float = 1.5e-3
@@ -33,7 +31,7 @@ class TrainingConfig:
     grasps_per_view: int = 72
     discriminator_iterations: int = 4000
     discriminator_rate: float = 1.0e-3
-    judging: JudgingConfig = field(default_factory=JudgingConfig)
+    labelling: LabellingConfig = field(default_factory=LabellingConfig)
     seed: int = 0
 
 
@@ -41,20 +39,20 @@ def train_generator(
     data: GraspData,
     config: TrainingConfig,
     checkpoint: Path,
-    progress: Progress,
+    progress: ProgressCallback,
     *,
     symmetric: bool = True,
     start_from: Denoiser | None = None,
 ) -> Denoiser:
-    """Return the generator, its weights averaged over the last iterations; goes on from `checkpoint` if it is there.
+    """Return the generator, its weights averaged over the last iterations; resumes from `checkpoint` if it exists.
 
     Args:
-        data: what to learn.
-        config: how long and how fast.
-        checkpoint: file to go on from and to write.
-        progress: told of each iteration.
-        symmetric: whether the hand is its own mirror image.
-        start_from: another hand's generator, to be tuned for this one.
+        data: views and ground-truth grasps.
+        config: iterations, rates and batches.
+        checkpoint: file to resume from and to write.
+        progress: called at each iteration.
+        symmetric: whether the gripper is its own mirror image.
+        start_from: generator of another gripper, to be tuned for this one.
     """
     model = _seeded(Denoiser, config.seed)
     if start_from is not None:
@@ -87,11 +85,11 @@ def train_generator(
 def train_discriminator(
     generator: Denoiser,
     data: GraspData,
-    judged: JudgedSamples,
+    labelled: LabelledSamples,
     *,
     config: TrainingConfig,
     checkpoint: Path,
-    progress: Progress,
+    progress: ProgressCallback,
     symmetric: bool = True,
 ) -> Discriminator:
     """Return the discriminator; its encoder starts from the generator's. `symmetric` as for that."""
@@ -101,10 +99,10 @@ def train_discriminator(
     average.load_state_dict(model.state_dict())
 
     def loss_at(rng: np.random.Generator) -> Tensor:
-        rows = rng.integers(0, len(judged.views), 16)
-        cloud = torch.from_numpy(data.clouds[judged.views[rows]].astype(np.float32))
-        cloud, grasps = augment(cloud, judged.grasps[rows], symmetric)
-        return F.binary_cross_entropy_with_logits(model(cloud, grasps).float(), judged.valid[rows])
+        rows = rng.integers(0, len(labelled.views), 16)
+        cloud = torch.from_numpy(data.clouds[labelled.views[rows]].astype(np.float32))
+        cloud, grasps = augment(cloud, labelled.grasps[rows], symmetric)
+        return F.binary_cross_entropy_with_logits(model(cloud, grasps).float(), labelled.valid[rows])
 
     for iteration, loss in _descend(
         model,
@@ -120,29 +118,29 @@ def train_discriminator(
 
 
 def calibrate_discriminator(
-    discriminator: Discriminator, data: GraspData, judged: JudgedSamples
+    discriminator: Discriminator, data: GraspData, labelled: LabelledSamples
 ) -> tuple[float, float]:
-    """Set scale and offset of the discriminator's logits so that its scores are the shares that hold; return both.
+    """Set scale and offset of the discriminator's logits so that scores are success ratios; return both.
 
     Args:
         discriminator: changed in its last layer.
-        data: shapes that it was not trained on.
-        judged: what was said of samples on those.
+        data: shapes outside of the training data.
+        labelled: samples on those.
     """
     with torch.inference_mode():
         logits = torch.cat(
             [
                 discriminator(torch.from_numpy(data.clouds[[view]].astype(np.float32)), grasps[None])
-                for view, grasps in zip(judged.views, judged.grasps, strict=True)
+                for view, grasps in zip(labelled.views, labelled.grasps, strict=True)
             ]
         )
-    x, y = logits.flatten().double().numpy(), judged.valid.flatten().double().numpy()
+    x, y = logits.flatten().double().numpy(), labelled.valid.flatten().double().numpy()
 
-    def surprise(parameters: np.ndarray) -> float:
+    def cross_entropy(parameters: np.ndarray) -> float:
         z = parameters[0] * x + parameters[1]
         return float(np.mean(np.logaddexp(0.0, z) - y * z))
 
-    scale, offset = (float(p) for p in minimize(surprise, [1.0, 0.0], method="Nelder-Mead").x)
+    scale, offset = (float(p) for p in minimize(cross_entropy, [1.0, 0.0], method="Nelder-Mead").x)
     last = discriminator.head.leave[-1]
     assert isinstance(last, nn.Linear)
     with torch.no_grad():
@@ -151,7 +149,7 @@ def calibrate_discriminator(
     return scale, offset
 
 
-def _seeded(make: Callable[[], Network], seed: int) -> Network:
+def _seeded(make: Callable[[], ModuleT], seed: int) -> ModuleT:
     torch.manual_seed(seed)
     return make()
 
@@ -176,7 +174,7 @@ def _descend(
         optimiser.load_state_dict(saved["optimiser"])
         start = int(saved["iteration"])
     for iteration in range(start, iterations):
-        # Seeds of each iteration's own: a resumed run draws what an unbroken one would.
+        # Seeds for each iteration: a resumed run draws the same numbers as an uninterrupted one.
         rng = np.random.default_rng((seed, iteration))
         torch.manual_seed(seed * 1_000_003 + iteration)
         for group in optimiser.param_groups:

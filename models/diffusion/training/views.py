@@ -10,66 +10,66 @@ from scipy.spatial.transform import Rotation
 
 from models.diffusion.training.solids import Solid
 
-_COARSE, _FINE = 36, 52  # rays along each side of the picture: to find the object, then to see it
+_COARSE, _FINE = 36, 52  # rays along each side of the picture: to find the object, then to render it
 _MIN_POINTS = 150
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ViewConfig:
-    """How objects lie and whence they are seen."""
+    """Distributions of object poses, viewpoints and depth errors."""
 
     distance_m: tuple[float, float] = (0.2, 0.6)
     """Range of the camera's distance [m]."""
-    frontal_share: float = 0.6
-    """Share of views from the front."""
+    frontal_ratio: float = 0.6
+    """Ratio of views from the front."""
     frontal_elevation_deg: tuple[float, float] = (-5.0, 30.0)
     """Range of the frontal views' elevation."""
     other_elevation_deg: tuple[float, float] = (-20.0, 85.0)
     """Range of all other views' elevation."""
-    upright_share: float = 0.55
-    """Share of objects that stand; of the rest half are tilted by up to 40°, half lie anyhow."""
-    one_face_share: float = 0.2
-    """Share of views square to an object's x or y side."""
-    occluded_share: float = 0.4
-    """Share of views with a part hidden."""
-    hidden: tuple[float, float] = (0.1, 0.45)
-    """Range of the hidden part of the points."""
+    upright_ratio: float = 0.55
+    """Ratio of upright objects; of the rest half are tilted by up to 40°, half have a random orientation."""
+    one_face_ratio: float = 0.2
+    """Ratio of views square to an object's x or y side."""
+    occluded_view_ratio: float = 0.4
+    """Ratio of views with an occluded part."""
+    occluded_point_ratio: tuple[float, float] = (0.1, 0.45)
+    """Range of the ratio of occluded points in those."""
     noise_per_m: tuple[float, float] = (0.002, 0.010)
     """Range of the depth noise's standard deviation over the squared distance [1/m]; 0.2 to 0.9 mm at 0.3 m."""
-    flying_share: float = 0.01
-    """Share of points smeared back along their ray."""
+    flying_point_ratio: float = 0.01
+    """Ratio of points shifted back along their ray."""
 
 
 def render_view(solid: Solid, config: ViewConfig, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return visible points (N, 3) in the camera frame and T_camera_object (4, 4); None if hardly anything shows."""
+    """Return visible points (N, 3) in the camera frame and T_camera_object (4, 4); None with too few points."""
     T_camera_object = _draw_pose(config, rng)
-    rays, reach = _look(solid, T_camera_object)
+    rays, reach = _render_depth(solid, T_camera_object)
     hit = np.isfinite(reach)
     if hit.sum() < _MIN_POINTS:
         return None
     reach = reach + _depth_error(reach, hit, rng.uniform(*config.noise_per_m), rng)
-    seen = _drop_grazing(solid, T_camera_object, rays, reach, hit=hit, rng=rng)
-    points = (rays * reach[..., None])[seen]
-    flying = rng.random(len(points)) < config.flying_share
+    visible = _drop_grazing(solid, T_camera_object, rays, reach, hit=hit, rng=rng)
+    points = (rays * reach[..., None])[visible]
+    flying = rng.random(len(points)) < config.flying_point_ratio
     points[flying] *= 1.0 + rng.exponential(0.01, (flying.sum(), 1)) / np.linalg.norm(points[flying], axis=1)[:, None]
-    if rng.random() < config.occluded_share:
-        points = _hide_part(points, rng.uniform(*config.hidden), rng)
+    if rng.random() < config.occluded_view_ratio:
+        points = _occlude_part(points, rng.uniform(*config.occluded_point_ratio), rng)
     return (points, T_camera_object) if len(points) >= _MIN_POINTS else None
 
 
 def _draw_pose(config: ViewConfig, rng: np.random.Generator) -> np.ndarray:
     kind = rng.random()
     turn = Rotation.identity()
-    if kind > config.upright_share:
-        tilted = kind < (1.0 + config.upright_share) / 2.0
+    if kind > config.upright_ratio:
+        tilted = kind < (1.0 + config.upright_ratio) / 2.0
         axis = np.append(rng.normal(size=2), 0.0)
         tilt = Rotation.from_rotvec(axis / np.linalg.norm(axis) * np.radians(rng.uniform(5.0, 40.0)))
         turn = tilt if tilted else Rotation.from_quat(rng.normal(size=4))
-    one_face = rng.random() < config.one_face_share
+    one_face = rng.random() < config.one_face_ratio
     azimuth = rng.integers(4) * np.pi / 2 + rng.normal(0.0, 0.04) if one_face else rng.uniform(0.0, 2 * np.pi)
-    frontal = rng.random() < config.frontal_share
+    frontal = rng.random() < config.frontal_ratio
     elevation = np.radians(rng.uniform(*(config.frontal_elevation_deg if frontal else config.other_elevation_deg)))
-    # Camera looking along +x of a level frame: image x = −y, image y = −z; then raised, swung round and rolled.
+    # Camera looking along +x of a level frame: image x = −y, image y = −z; then raised, turned and rolled.
     level = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
     roll = Rotation.from_euler("z", rng.uniform(-np.pi, np.pi))
     R = roll.as_matrix() @ level @ Rotation.from_euler("zy", [azimuth, -elevation]).as_matrix() @ turn.as_matrix()
@@ -80,8 +80,8 @@ def _draw_pose(config: ViewConfig, rng: np.random.Generator) -> np.ndarray:
     return T
 
 
-def _look(solid: Solid, T_camera_object: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return unit rays (52, 52, 3) about the object's outline and how far (52, 52) they run to it [m]."""
+def _render_depth(solid: Solid, T_camera_object: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return unit rays (52, 52, 3) over the object's outline and their lengths (52, 52) to it [m]."""
     center, radius = T_camera_object[:3, 3], solid.enclosing_radius()
     middle = center[:2] / center[2]
     half = 1.1 * radius / center[2]
@@ -115,17 +115,17 @@ def _depth_error(reach: np.ndarray, hit: np.ndarray, noise_per_m: float, rng: np
 def _drop_grazing(
     solid: Solid, T_camera_object: np.ndarray, rays: np.ndarray, reach: np.ndarray, *, hit: np.ndarray, rng
 ) -> np.ndarray:
-    """Return the mask (52, 52) of what stays: surfaces seen at a flat angle are often lost."""
+    """Return the mask (52, 52) of the points that remain: surfaces at a grazing angle often get no depth."""
     R, t = T_camera_object[:3, :3], T_camera_object[:3, 3]
     points = (rays[hit] * reach[hit, None] - t) @ R
     facing = np.abs(np.sum(solid.normals(points) * (rays[hit] @ R), axis=1))
-    seen = hit.copy()
-    seen[hit] = rng.random(len(points)) < np.clip(facing / 0.3, 0.05, 1.0)
-    return seen
+    visible = hit.copy()
+    visible[hit] = rng.random(len(points)) < np.clip(facing / 0.3, 0.05, 1.0)
+    return visible
 
 
-def _hide_part(points: np.ndarray, share: float, rng: np.random.Generator) -> np.ndarray:
-    """Return `points` without the `share` that lies furthest to one side of the picture."""
+def _occlude_part(points: np.ndarray, ratio: float, rng: np.random.Generator) -> np.ndarray:
+    """Return `points` without the `ratio` of them furthest to one side of the picture."""
     angle = rng.uniform(0.0, 2.0 * np.pi)
     side = points[:, :2] @ np.array([np.cos(angle), np.sin(angle)])
-    return points[side <= np.quantile(side, 1.0 - share)]
+    return points[side <= np.quantile(side, 1.0 - ratio)]

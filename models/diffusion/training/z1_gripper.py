@@ -1,7 +1,8 @@
-"""The Z1's beak as a hand to train for: one fixed jaw, one that turns, laid around an object by its width.
+"""The Z1's gripper as a target of the training: one stationary jaw, and one that turns, fitted around a width.
 
-`pivot` is the frame of the turning jaw's axis: x towards the tips, y along the axis; the fixed jaw lies below (−z). In
-the grasp frame y runs from the fixed jaw to the turning one, so this hand is not its own mirror image.
+`pivot` is the frame of the moving jaw's axis (`hal.base.z1_gripper`): x towards the tips, y along the axis, the
+stationary jaw at −z. In the grasp frame y runs from the stationary jaw to the moving one, so this gripper is not its
+own mirror image.
 """
 
 from __future__ import annotations
@@ -13,44 +14,21 @@ from typing import ClassVar
 import numpy as np
 from numba import njit
 
+from hal.base.z1_gripper import (
+    HALF_WIDTH,
+    MOVING_BACK,
+    MOVING_FACE,
+    PALM_HALF_WIDTH_M,
+    ROOT_RADIUS_M,
+    STATIONARY_BACK,
+    STATIONARY_FACE,
+    WRIST_HALF_M,
+    WRIST_X_M,
+)
+from models.diffusion.grippers import MAX_WIDTHS_M
 from models.diffusion.training.solids import distance_at, normal_at, trace
 
-FIXED_FACE = (
-    (0.1000, -0.0090),
-    (0.0751, -0.0090),
-    (0.0516, -0.0177),
-    (0.0430, -0.0188),
-    (0.0323, -0.0185),
-)
-"""x, z of the fixed jaw's inner face in the pivot frame, tip first [m]; as in
-`z1_runtime/geometry/gripper_geometry.py`, from the collision meshes of the Z1's description."""
-TURNING_FACE = (
-    (0.1000, -0.0090),
-    (0.0762, -0.0090),
-    (0.0727, -0.0083),
-    (0.0569, -0.0012),
-    (0.0493, 0.0009),
-    (0.0410, 0.0013),
-)
-"""x, z of the turning jaw's inner face when the beak is closed, tip first [m]; same source."""
-FIXED_BACK = (
-    (0.100, -0.0248),
-    (0.090, -0.0279),
-    (0.080, -0.0318),
-    (0.065, -0.0352),
-    (0.050, -0.0363),
-    (0.035, -0.0364),
-)
-"""x, z of the fixed jaw's outer side [m]; measured from the same meshes."""
-TURNING_BACK = ((0.100, 0.0081), (0.090, 0.0129), (0.080, 0.0177), (0.065, 0.0230), (0.050, 0.0257), (0.035, 0.0262))
-"""x, z of the turning jaw's outer side when closed [m]; same source."""
-HALF_WIDTH = ((0.035, 0.041), (0.060, 0.0391), (0.080, 0.0352), (0.100, 0.0307))
-"""x and half the width along y of both jaws [m]; same source."""
-PALM_RADIUS_M, PALM_HALF_WIDTH_M = 0.0335, 0.041
-"""The palm is a cylinder about the turning jaw's axis; same source."""
-WRIST = ((-0.100, -0.030), 0.030)
-"""x range and half the height and width of what lies behind the palm [m]; same source."""
-LAY = (
+GRIPPER_FIT = (
     (0.004, 0.3007, 0.0763, 0.0025, 0.0517),
     (0.012, 0.4080, 0.0753, 0.0065, 0.1052),
     (0.020, 0.5186, 0.0738, 0.0105, 0.1883),
@@ -63,84 +41,85 @@ LAY = (
     (0.076, 1.2787, 0.0660, 0.0376, 0.5511),
     (0.084, 1.3469, 0.0681, 0.0420, 0.5827),
 )
-"""How the opened beak lies around a width: width [m], opening [rad], middle of the object x, z in the pivot frame [m],
-tilt of the approach from x [rad]. From `BeakGripper` in `z1_runtime/grasping/beak_gripper.py`; a test
-holds the two together."""
+"""Pose of the opened gripper around a width: width [m], opening [rad], object's middle x, z in the pivot frame [m],
+tilt of the approach from x [rad]. Output of the runtime's gripper fit at the time of the training, which fixes the
+labels; a test compares the two."""
 CONTACT_DEPTH_M = 0.012
-"""How far the grasp's origin lies beyond the middle of the contacts when the beak is laid; same source."""
+"""Distance from the middle of the contacts to the grasp's origin along the approach [m]; same source."""
 
 _SAME_CONTACT_M = 0.0015
-_HIT_M = 2e-4
-_MAX_GAP_M = 0.025  # the object is pushed no further than this before it leans on the fixed jaw
+_HIT_M = 2e-4  # as in `solids.trace`
+_MAX_GAP_M = 0.025  # maximum distance that an object is pushed to the stationary jaw
 
 
 @dataclass(frozen=True, kw_only=True)
-class BeakSpec:
-    """A hand whose one jaw turns towards the other, in the grasp frame: z approach, y from the fixed jaw on."""
+class Z1GripperSpec:
+    """Gripper with one moving jaw, in the grasp frame: z approach, y from the stationary jaw to the moving one."""
 
     name: str
-    max_width_m: float = 0.080
+    max_width_m: float = MAX_WIDTHS_M["z1"]
     """Widest object that ground truth closes on [m]."""
     min_width_m: float = 0.004
     """Narrowest [m]."""
     min_depth_m: float = 0.007
-    """Least distance from the contacts' middle to the grasp's origin in ground truth [m]."""
+    """Minimum distance from the contacts' middle to the grasp's origin in ground truth [m]."""
     max_depth_m: float = 0.017
-    """Greatest [m]."""
+    """Maximum [m]."""
     friction: float = 0.5
     """Coulomb coefficient that a valid grasp may count on."""
     symmetric: ClassVar[bool] = False
-    """Whether the hand looks the same turned over."""
+    """Whether the gripper is the same turned over."""
 
     @cached_property
-    def fixed_points(self) -> np.ndarray:
-        """(K, 3) points on what does not move, in the pivot frame; they must not touch an object [m]."""
-        angle = np.arctan2(-0.0185, 0.0281) - np.linspace(0.0, 1.5 * np.pi, 9)  # from the fixed jaw's root round
-        circle = PALM_RADIUS_M * np.column_stack([np.cos(angle), np.sin(angle)])
+    def stationary_points(self) -> np.ndarray:
+        """(K, 3) points on stationary jaw, palm and wrist in the pivot frame, for the collision check [m]."""
+        angle = np.arctan2(-0.0185, 0.0281) - np.linspace(0.0, 1.5 * np.pi, 9)  # from the stationary jaw's root on
+        circle = ROOT_RADIUS_M * np.column_stack([np.cos(angle), np.sin(angle)])
         palm = [np.column_stack([circle[:, 0], np.full(9, y), circle[:, 1]]) for y in PALM_HALF_WIDTH_M * _ACROSS]
-        (back, front), half = WRIST
-        wrist = np.array([(x, y, z) for x in (back, front) for y in (-half, half) for z in (-half, 0.0, half)])
-        return np.concatenate([_across(FIXED_FACE + FIXED_BACK), *palm, wrist])
+        half = WRIST_HALF_M
+        wrist = np.array([(x, y, z) for x in WRIST_X_M for y in (-half, half) for z in (-half, 0.0, half)])
+        return np.concatenate([_across(np.concatenate([_LABEL_FACE, STATIONARY_BACK])), *palm, wrist])
 
     @cached_property
-    def turning_points(self) -> np.ndarray:
-        """(K, 3) points on the turning jaw when closed, in the pivot frame [m]."""
-        return _across(TURNING_FACE + TURNING_BACK)
+    def moving_points(self) -> np.ndarray:
+        """(K, 3) points on the moving jaw when closed, in the pivot frame [m]."""
+        return _across(np.concatenate([MOVING_FACE, MOVING_BACK]))
 
     @cached_property
-    def fixed_face_points(self) -> np.ndarray:
-        """(P, 3) points of the fixed jaw that objects lean on [m]."""
-        return _across(_denser(FIXED_FACE))
+    def stationary_face_points(self) -> np.ndarray:
+        """(P, 3) points of the stationary jaw that objects lean on [m]."""
+        return _across(_resample(_LABEL_FACE))
 
     @cached_property
-    def turning_face_points(self) -> np.ndarray:
-        """(P, 3) points of the turning jaw that push, when closed [m]."""
-        return _across(_denser(TURNING_FACE))
+    def moving_face_points(self) -> np.ndarray:
+        """(P, 3) points of the moving jaw that push, when closed [m]."""
+        return _across(_resample(MOVING_FACE))
 
 
 _ACROSS = np.array([-1.0, -0.5, 0.0, 0.5, 1.0])
+_LABEL_FACE = STATIONARY_FACE[:5]  # the labels were made without the face's last point, which the root covers
 
 
-def _across(outline: tuple[tuple[float, float], ...]) -> np.ndarray:
-    """Return points (K, 3) of an outline, five over the jaw's width."""
-    x, z = np.array(outline).T
-    half = np.interp(x, *np.array(HALF_WIDTH).T)
-    return np.concatenate([np.column_stack([x, share * half, z]) for share in _ACROSS])
+def _across(outline: np.ndarray) -> np.ndarray:
+    """Return points (5 K, 3) of an outline (K, 2), five over the jaw's width."""
+    x, z = outline.T
+    half = np.interp(x, *HALF_WIDTH.T)
+    return np.concatenate([np.column_stack([x, fraction * half, z]) for fraction in _ACROSS])
 
 
-def _denser(outline: tuple[tuple[float, float], ...], spacing_m: float = 0.006) -> tuple[tuple[float, float], ...]:
-    points = np.array(outline)
+def _resample(points: np.ndarray, spacing_m: float = 0.006) -> np.ndarray:
+    """Return `points` (K, 2) of a polyline at about `spacing_m` along it, (L, 2)."""
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
     at = np.linspace(0.0, along[-1], round(along[-1] / spacing_m) + 1)
-    return tuple(zip(np.interp(at, along, points[:, 0]), np.interp(at, along, points[:, 1]), strict=True))
+    return np.column_stack([np.interp(at, along, points[:, 0]), np.interp(at, along, points[:, 1])])
 
 
 @njit(cache=True)
-def _place(T, lay, width):
-    """Return T_object_pivot (4, 4) and the opening [rad] of the beak laid around `width` for the grasp `T`."""
-    opening = np.interp(width, lay[:, 0], lay[:, 1])
-    x, z = np.interp(width, lay[:, 0], lay[:, 2]), np.interp(width, lay[:, 0], lay[:, 3])
-    tilt = np.interp(width, lay[:, 0], lay[:, 4])
+def _place(T, fit, width):
+    """Return T_object_pivot (4, 4) and the opening [rad] of the gripper fitted around `width` for the grasp `T`."""
+    opening = np.interp(width, fit[:, 0], fit[:, 1])
+    x, z = np.interp(width, fit[:, 0], fit[:, 2]), np.interp(width, fit[:, 0], fit[:, 3])
+    tilt = np.interp(width, fit[:, 0], fit[:, 4])
     c, s = np.cos(tilt), np.sin(tilt)
     T_grasp_pivot = np.zeros((4, 4))
     T_grasp_pivot[0, 1] = T_grasp_pivot[3, 3] = 1.0
@@ -161,7 +140,7 @@ def _at(T, x, y, z):
 
 @njit(cache=True)
 def _turn(p, opening):
-    """Return a point of the closed turning jaw when it is opened."""
+    """Return a point of the closed moving jaw when it is opened."""
     c, s = np.cos(opening), np.sin(opening)
     return c * p[0] - s * p[2], p[1], s * p[0] + c * p[2]
 
@@ -178,7 +157,7 @@ def _clear(parts, profiles, T, points, opening, clearance):  # noqa: PLR0917 (co
 
 @njit(cache=True)
 def _close(parts, profiles, T, face, opening):
-    """Turn the jaw until it touches: return the contact's middle (3,), its normal (3,), and whether there is one."""
+    """Close the jaw until it touches; return the contact's middle (3,), its normal (3,), and whether there is one."""
     reach = np.empty(len(face))
     for k in range(len(face)):
         p = face[k]
@@ -210,8 +189,8 @@ def _close(parts, profiles, T, face, opening):
 
 
 @njit(cache=True)
-def _lean(parts, profiles, T, face, along):
-    """Move the fixed jaw along `along` (3,) until it touches: as `_close`, and how far it moved."""
+def _push_to_stationary_jaw(parts, profiles, T, face, along):
+    """Move the stationary jaw along `along` (3,) until it touches; return as `_close`."""
     reach = np.empty(len(face))
     origins = np.empty((len(face), 3))
     for k in range(len(face)):
@@ -234,30 +213,33 @@ def _lean(parts, profiles, T, face, along):
 
 
 @njit(cache=True)
-def check_beak(parts, profiles, T, widths, fixed, turning, fixed_face, turning_face, lay, clearance, cos_cone):  # noqa: PLR0917
+def check_z1_grasps(  # noqa: PLR0917
+    parts, profiles, T, widths, stationary, moving, stationary_face, moving_face, fit, clearance, cos_cone
+):
     """Return free, antipodal, widths and offsets (N,) as a `GraspCheck` holds them.
 
-    The beak is laid around the stated `widths` (N,), the fixed jaw just beside the surface. The turning jaw closes
-    and pushes the object, without turning it, against the fixed one.
+    The gripper is fitted around the stated `widths` (N,), the stationary jaw just off the surface. The moving jaw
+    closes and pushes the object, without turning it, against the stationary one.
     """
     n = len(T)
     free, antipodal = np.zeros(n, dtype=np.bool_), np.zeros(n, dtype=np.bool_)
-    seen, offsets = np.full(n, np.nan), np.full(n, np.nan)
+    contact_widths, offsets = np.full(n, np.nan), np.full(n, np.nan)
     for i in range(n):
-        T_object_pivot, opening = _place(T[i], lay, widths[i])
-        free[i] = _clear(parts, profiles, T_object_pivot, fixed, 0.0, clearance) and _clear(
-            parts, profiles, T_object_pivot, turning, opening, clearance
+        T_object_pivot, opening = _place(T[i], fit, widths[i])
+        free[i] = _clear(parts, profiles, T_object_pivot, stationary, 0.0, clearance) and _clear(
+            parts, profiles, T_object_pivot, moving, opening, clearance
         )
         if not free[i]:
             continue
-        pushed, push_normal, pushes = _close(parts, profiles, T_object_pivot, turning_face, opening)
+        pushed, push_normal, pushes = _close(parts, profiles, T_object_pivot, moving_face, opening)
         if not pushes:
             continue
         y = T[i, :3, 1].copy()
-        leant, lean_normal, leans = _lean(parts, profiles, T_object_pivot, fixed_face, y)
+        leant, lean_normal, leans = _push_to_stationary_jaw(parts, profiles, T_object_pivot, stationary_face, y)
         if not leans:
             continue
-        seen[i] = np.sum((pushed - leant) * y)
+        contact_widths[i] = np.sum((pushed - leant) * y)
         offsets[i] = np.sum((0.5 * (pushed + leant) - T[i, :3, 3]) * y)
-        antipodal[i] = np.sum(push_normal * y) > cos_cone and -np.sum(lean_normal * y) > cos_cone and seen[i] > 0.0
-    return free, antipodal, seen, offsets
+        within_cones = np.sum(push_normal * y) > cos_cone and -np.sum(lean_normal * y) > cos_cone
+        antipodal[i] = within_cones and contact_widths[i] > 0.0
+    return free, antipodal, contact_widths, offsets

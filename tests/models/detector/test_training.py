@@ -1,4 +1,4 @@
-"""How the detector learns: what the loss is, and that a phase goes on where it stopped."""
+"""Training of the detector: its loss, and the resumption of a phase."""
 
 from pathlib import Path
 
@@ -13,13 +13,13 @@ import torch
 from models.detector.training import (
     AUGMENTATION,
     Bf16SegmentationModel,
-    Phase,
+    TrainingPhase,
     read_checkpoint,
     train_phase,
 )
 
 
-def test_the_loss_in_bfloat16_is_the_loss_but_for_rounding() -> None:
+def test_the_loss_in_bfloat16_differs_by_rounding_only() -> None:
     from ultralytics.cfg import get_cfg
     from ultralytics.nn.tasks import SegmentationModel
 
@@ -39,7 +39,7 @@ def test_the_loss_in_bfloat16_is_the_loss_but_for_rounding() -> None:
     assert ours.sum().item() == pytest.approx(plain.sum().item(), rel=0.05)
 
 
-def test_a_phase_that_is_done_is_not_done_again_and_gives_finite_weights(tmp_path: Path) -> None:
+def test_a_complete_phase_is_not_repeated_and_gives_finite_weights(tmp_path: Path) -> None:
     for split in ("train", "val"):
         (tmp_path / "images" / split).mkdir(parents=True)
         (tmp_path / "labels" / split).mkdir(parents=True)
@@ -50,7 +50,7 @@ def test_a_phase_that_is_done_is_not_done_again_and_gives_finite_weights(tmp_pat
             (tmp_path / f"labels/{split}/{number}.txt").write_text("1 0.25 0.25 0.75 0.25 0.75 0.75 0.25 0.75\n")
     names = "names: {0: bottle, 1: box, 2: cylinder}\n"
     (tmp_path / "data.yaml").write_text(f"path: {tmp_path}\ntrain: images/train\nval: images/val\n{names}")
-    phase = Phase(imgsz=64, epochs=1, lr0=1e-3, lrf=0.5, warmup_epochs=0.0, batch=2)
+    phase = TrainingPhase(imgsz=64, epochs=1, lr0=1e-3, lrf=0.5, warmup_epochs=0.0, batch=2)
     threads = torch.get_num_threads()
     where = {"data": tmp_path / "data.yaml", "folder": tmp_path / "run/0", "start": None, "seed": 0}
     last = train_phase(phase, **where, threads=threads)

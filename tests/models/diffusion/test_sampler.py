@@ -10,14 +10,18 @@ import torch
 from scipy.special import ndtr
 from scipy.stats.qmc import discrepancy
 
-from models.diffusion.sampler import DiffusionConfig, DiffusionSampler, even_normal
+from hal.base.errors import InvalidValueError
+from hal.base.transforms import inverse
+from models.diffusion.sampler import DiffusionConfig, DiffusionSampler, draw_even_normal
 from models.diffusion.selection import choose_grasps
-from models.diffusion.training.labels import GRIPPERS, check_grasps
+from models.diffusion.training.grippers import GRIPPERS
+from models.diffusion.training.labels import check_grasps
 from models.diffusion.training.shapes import make_shape
 from models.diffusion.training.views import ViewConfig, render_view
 from models.diffusion.weights import WeightsError
+from tests.support.errors import raises
 
-VIEW = ViewConfig(occluded_share=0.0, flying_share=0.0)
+VIEW = ViewConfig(occluded_view_ratio=0.0, flying_point_ratio=0.0)
 
 
 @pytest.fixture(scope="module")
@@ -25,16 +29,16 @@ def sampler() -> DiffusionSampler:
     return DiffusionSampler()
 
 
-def a_bottle(seed: int):
+def make_bottle_view(seed: int):
     rng = np.random.default_rng(seed)
     solid = make_shape("bottle", rng)
-    seen = render_view(solid, VIEW, rng)
-    assert seen is not None
-    return solid, *seen
+    view = render_view(solid, VIEW, rng)
+    assert view is not None
+    return solid, *view
 
 
-def test_grasps_are_proper_scored_and_best_first(sampler):
-    grasps = sampler.sample(a_bottle(0)[1], 100, 0)
+def test_grasps_are_rigid_scored_and_best_first(sampler):
+    grasps = sampler.sample(make_bottle_view(0)[1], 100, 0)
     R = grasps.T_camera_grasps[:, :3, :3]
     assert len(grasps) == 100
     assert R @ R.transpose(0, 2, 1) == pytest.approx(np.tile(np.eye(3), (100, 1, 1)), abs=1e-6)
@@ -45,7 +49,7 @@ def test_grasps_are_proper_scored_and_best_first(sampler):
 
 
 def test_the_same_seed_gives_the_same_grasps_and_another_seed_others(sampler):
-    points = a_bottle(0)[1]
+    points = make_bottle_view(0)[1]
     first, again, other = (sampler.sample(points, 50, seed) for seed in (3, 3, 4))
     assert np.array_equal(first.T_camera_grasps, again.T_camera_grasps)
     assert np.array_equal(first.scores, again.scores)
@@ -53,7 +57,7 @@ def test_the_same_seed_gives_the_same_grasps_and_another_seed_others(sampler):
 
 
 def test_turning_the_camera_turns_the_grasps_and_nothing_else(sampler):
-    points = a_bottle(1)[1]
+    points = make_bottle_view(1)[1]
     R = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
     R *= np.linalg.det(R)
     grasps, turned = sampler.sample(points, 60, 0), sampler.sample(points @ R.T, 60, 0)
@@ -61,12 +65,12 @@ def test_turning_the_camera_turns_the_grasps_and_nothing_else(sampler):
     assert turned.T_camera_grasps[:10, :3, :3] == pytest.approx(R @ grasps.T_camera_grasps[:10, :3, :3], abs=2e-3)
 
 
-def test_most_grasps_of_unseen_bottles_hold_and_the_best_scored_more_than_the_worst(sampler):
+def test_most_grasps_of_new_bottles_are_valid_and_the_best_scored_more_than_the_worst(sampler):
     raw, best, worst, width_errors = [], [], [], []
     for seed in range(50, 60):
-        solid, points, T_camera_object = a_bottle(seed)
+        solid, points, T_camera_object = make_bottle_view(seed)
         grasps = sampler.sample(points, 200, 0)
-        check = check_grasps(solid, np.linalg.inv(T_camera_object) @ grasps.T_camera_grasps, GRIPPERS["agnostic"])
+        check = check_grasps(solid, inverse(T_camera_object) @ grasps.T_camera_grasps, GRIPPERS["agnostic"])
         raw.append(check.valid.mean())
         best.append(check.valid[:50].mean())
         worst.append(check.valid[-50:].mean())
@@ -76,11 +80,11 @@ def test_most_grasps_of_unseen_bottles_hold_and_the_best_scored_more_than_the_wo
     assert np.median(width_errors) < 0.012
 
 
-def test_drawing_more_than_are_given_out_gives_better_ones_of_as_many_kinds(sampler):
+def test_oversampling_gives_better_grasps_of_as_many_kinds(sampler):
     drawn_valid, chosen_valid, drawn_kinds, chosen_kinds = [], [], [], []
     for seed in range(70, 78):
-        solid, points, T_camera_object = a_bottle(seed)
-        T_object_camera = np.linalg.inv(T_camera_object)
+        solid, points, T_camera_object = make_bottle_view(seed)
+        T_object_camera = inverse(T_camera_object)
         for grasps, valid, kinds in (
             (sampler.draw(points, 200, 0), drawn_valid, drawn_kinds),
             (sampler.sample(points, 200, 0), chosen_valid, chosen_kinds),
@@ -93,86 +97,91 @@ def test_drawing_more_than_are_given_out_gives_better_ones_of_as_many_kinds(samp
 
 
 def test_bfloat16_moves_grasps_by_a_fraction_of_a_millimetre(sampler, monkeypatch):
-    _, points, _ = a_bottle(70)
+    _, points, _ = make_bottle_view(70)
     places = []
     for quick in (False, True):
-        monkeypatch.setattr(sampler, "_quick", quick)
+        monkeypatch.setattr(sampler, "_use_bfloat16", quick)
         places.append(sampler.draw(points, 200, 0).T_camera_grasps[:, :3, 3])
-    apart = np.linalg.norm(places[0] - places[1], axis=1)
-    assert 0.0 < np.median(apart) < 5e-4
+    distance = np.linalg.norm(places[0] - places[1], axis=1)
+    assert 0.0 < np.median(distance) < 5e-4
 
 
-def test_of_many_alike_the_best_go_first_and_the_best_of_another_kind_is_not_forgotten():
+def test_of_similar_grasps_the_best_come_first_and_the_best_of_another_kind_is_kept():
     T = np.tile(np.eye(4), (11, 1, 1))
     T[:, :3, 3] = (0.01, 0.01, 0.01)
     T[10, :3, 3] = (0.10, 0.01, 0.01)
     scores = np.append(np.linspace(0.9, 0.8, 10), 0.5)
-    assert choose_grasps(T, scores, 3).tolist() == [0, 1, 10]  # the third of a kind is worth its score, no more
+    assert choose_grasps(T, scores, 3).tolist() == [0, 1, 10]
     assert choose_grasps(T, scores, 11).tolist() == list(range(11))
 
 
 @pytest.mark.parametrize("n", [1, 7, 800])
-def test_noise_is_normal_and_of_the_seed(n):
-    noise = even_normal(n, 10, np.random.default_rng(3))
+def test_noise_is_finite_and_depends_on_the_seed(n):
+    noise = draw_even_normal(n, 10, np.random.default_rng(3))
     assert noise.shape == (n, 10)
     assert np.isfinite(noise).all()
-    assert (noise == even_normal(n, 10, np.random.default_rng(3))).all()
-    assert (noise != even_normal(n, 10, np.random.default_rng(4))).any()
+    assert (noise == draw_even_normal(n, 10, np.random.default_rng(3))).all()
+    assert (noise != draw_even_normal(n, 10, np.random.default_rng(4))).any()
 
 
 def test_noise_fills_its_space_more_evenly_than_independent_draws():
-    even, independent = even_normal(800, 10, np.random.default_rng(0)), np.random.default_rng(0).normal(size=(800, 10))
+    even, independent = (
+        draw_even_normal(800, 10, np.random.default_rng(0)),
+        np.random.default_rng(0).normal(size=(800, 10)),
+    )
     assert discrepancy(ndtr(even)) < 0.5 * discrepancy(ndtr(independent))
     assert even.std(axis=0) == pytest.approx(np.ones(10), abs=0.05)
 
 
-def test_several_objects_get_what_each_would_get_alone(sampler):
-    clouds = [a_bottle(seed)[1] for seed in (0, 1, 2)]
+def test_a_batch_gives_the_same_grasps_as_single_clouds(sampler):
+    clouds = [make_bottle_view(seed)[1] for seed in (0, 1, 2)]
     for points, grasps in zip(clouds, sampler.sample_batch(clouds, 40, 7), strict=True):
         alone = sampler.sample(points, 40, 7)
         assert np.array_equal(grasps.T_camera_grasps, alone.T_camera_grasps)
         assert np.array_equal(grasps.scores, alone.scores)
 
 
-def test_a_batch_says_which_cloud_it_cannot_take(sampler):
-    good = a_bottle(0)[1]
-    with pytest.raises(ValueError, match=r"Cloud 1 of 2.*millimetres"):
+def test_a_batch_names_the_bad_cloud(sampler):
+    good = make_bottle_view(0)[1]
+    with raises(InvalidValueError, "cloud_extent") as caught:
         sampler.sample_batch([good, 1000.0 * good], 10, 0)
-    with pytest.raises(ValueError, match="No cloud"):
+    assert "Cloud 1 of 2" in str(caught.value)
+    with raises(InvalidValueError, "no_clouds"):
         sampler.sample_batch([], 10, 0)
 
 
-def test_cuda_is_used_when_there_and_refused_when_not():
+def test_cuda_is_used_if_available_and_rejected_if_not():
     if torch.cuda.is_available():
         assert DiffusionSampler().device == "cuda"
     else:
-        with pytest.raises(ValueError, match="no CUDA device"):
+        with raises(InvalidValueError, "no_cuda"):
             DiffusionSampler(DiffusionConfig(device="cuda"))
 
 
 @pytest.mark.parametrize(
-    ("points", "message"),
+    ("points", "code"),
     [
-        (np.zeros((0, 3)), "30 points"),
-        (np.zeros((5, 3)), "30 points"),
-        (np.zeros((100, 2)), "30 points"),
-        (np.full((100, 3), np.inf), "infinite"),
-        (np.full((100, 3), np.nan), "NaN"),
-        (np.tile([0.0, 0.0, 0.4], (100, 1)), "spans"),
-        (np.random.default_rng(0).normal(size=(100, 3)) * 30.0, "millimetres"),
+        (np.zeros((0, 3)), "cloud_points"),
+        (np.zeros((5, 3)), "cloud_points"),
+        (np.zeros((100, 2)), "cloud_points"),
+        (np.full((100, 3), np.inf), "cloud_not_finite"),
+        (np.full((100, 3), np.nan), "cloud_not_finite"),
+        (np.tile([0.0, 0.0, 0.4], (100, 1)), "cloud_extent"),
+        (np.random.default_rng(0).normal(size=(100, 3)) * 30.0, "cloud_extent"),
     ],
 )
-def test_clouds_that_cannot_be_grasped_are_refused(sampler, points, message):
-    with pytest.raises(ValueError, match=message):
+def test_unusable_clouds_are_rejected(sampler, points, code):
+    with raises(InvalidValueError, code):
         sampler.sample(points, 10, 0)
 
 
-def test_nonsense_settings_and_missing_weights_are_refused(tmp_path):
-    nonsense: dict[str, Any] = {"steps": 0, "threads": 0, "temperature": 0.0, "drawn": 0.5, "device": "tpu"}
-    for setting, value in nonsense.items():
-        with pytest.raises(ValueError, match=setting):
+def test_invalid_settings_and_missing_weights_are_rejected(tmp_path):
+    invalid: dict[str, Any] = {"steps": 0, "threads": 0, "temperature": 0.0, "oversampling": 0.5, "device": "tpu"}
+    for setting, value in invalid.items():
+        with raises(InvalidValueError, f"diffusion_{setting}") as caught:
             DiffusionConfig(**{setting: value})
-    with pytest.raises(WeightsError, match="missing"):
+        assert setting in str(caught.value) and str(value) in str(caught.value)
+    with raises(WeightsError, "weights_missing"):
         DiffusionSampler(DiffusionConfig(weights=tmp_path / "none.npz"))
 
 

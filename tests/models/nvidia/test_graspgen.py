@@ -15,11 +15,13 @@ import pytest
 import torch
 import yaml
 
+from hal.base.errors import InvalidValueError
 from models.nvidia.errors import GeneratorError
-from models.nvidia.nvidia import NvidiaSampler, load_here
+from models.nvidia.nvidia import NvidiaSampler, load_in_process
 from models.nvidia.process import ProcessGenerator
-from models.nvidia.torch_patches import cuda_only_if_there, drawn_from, fold_attention
+from models.nvidia.torch_patches import cuda_if_available, fold_attention, seed_random_numbers
 from models.types import GraspGenerator
+from tests.support.errors import raises
 
 CLOUD = np.random.default_rng(0).uniform([-0.03, -0.05, 0.38], [0.03, 0.05, 0.42], (700, 3))
 
@@ -34,7 +36,7 @@ NAMES = [pytest.param("graspgen", marks=needs("grasp_gen")), pytest.param("grasp
 
 @pytest.fixture(scope="module")
 def checkpoints(tmp_path_factory):
-    """Return what makes, once each, the checkpoint of a name."""
+    """Return a function that makes, once each, the checkpoint of a name."""
     made: dict[str, Path] = {}
 
     def make(name: str) -> Path:
@@ -50,12 +52,12 @@ def checkpoints(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def loaded(checkpoints):
-    """Return what loads, once each, the generator of a name."""
+    """Return a function that loads, once each, the generator of a name."""
     made: dict[str, GraspGenerator] = {}
 
     def load(name: str) -> NvidiaSampler:
         if name not in made:
-            made[name] = load_here(name, checkpoints(name))
+            made[name] = load_in_process(name, checkpoints(name))
         generator = made[name]
         assert isinstance(generator, NvidiaSampler)
         return generator
@@ -64,7 +66,7 @@ def loaded(checkpoints):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_checkpoint_gives_as_many_rigid_grasps_as_asked_best_first(name, loaded):
+def test_a_checkpoint_gives_the_requested_number_of_rigid_grasps_best_first(name, loaded):
     grasps = loaded(name).sample(CLOUD, 37, 0)
     R = grasps.T_camera_grasps[:, :3, :3]
     assert len(grasps) == 37 and grasps.source.startswith(name)
@@ -84,11 +86,11 @@ def test_the_same_seed_gives_the_same_grasps_and_another_seed_others(name, loade
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_the_grasps_are_theirs_moved_to_the_fingertips_and_turned(name, loaded):
+def test_the_grasps_are_those_of_the_package_moved_to_the_fingertips_and_turned(name, loaded):
     ours = loaded(name).sample(CLOUD, 12, 4)
     order = np.random.default_rng(4).permutation(len(CLOUD))
     theirs = loaded(name)._sampler
-    with cuda_only_if_there(), drawn_from(4):
+    with cuda_if_available(), seed_random_numbers(4):
         T, scores, _ = theirs.sample(torch.from_numpy(CLOUD[order]).float(), -1.0, 12, remove_outliers=False)
     best_first = torch.argsort(-scores, stable=True)
     T = T[best_first].double().numpy()
@@ -101,7 +103,7 @@ def test_the_grasps_are_theirs_moved_to_the_fingertips_and_turned(name, loaded):
 
 
 @needs("grasp_gen")
-def test_their_own_control_points_lie_on_our_closing_axis():
+def test_the_packages_control_points_are_on_our_closing_axis():
     from grasp_gen.robot import get_gripper_info
 
     from models.nvidia.nvidia import T_NVIDIA_GRASP
@@ -114,7 +116,7 @@ def test_their_own_control_points_lie_on_our_closing_axis():
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_folding_their_attention_changes_nothing_but_rounding(name, checkpoints, loaded):
+def test_folded_attention_differs_by_rounding_only(name, checkpoints, loaded):
     if name == "graspgen":
         from grasp_gen.grasp_server import load_grasp_cfg
         from grasp_gen.models.generator import GraspGenGenerator
@@ -142,40 +144,40 @@ def test_folding_their_attention_changes_nothing_but_rounding(name, checkpoints,
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_its_own_process_gives_the_same_as_ours(name, checkpoints, loaded):
+def test_a_process_of_its_own_gives_the_same_grasps(name, checkpoints, loaded):
     generator = ProcessGenerator(name, checkpoints(name), Path(sys.executable))
     try:
         there, here = generator.sample(CLOUD, 9, 3), loaded(name).sample(CLOUD, 9, 3)
         np.testing.assert_allclose(there.T_camera_grasps, here.T_camera_grasps, atol=1e-5)
         np.testing.assert_allclose(there.scores, here.scores, atol=1e-6)
         assert there.source == here.source
-        with pytest.raises(ValueError, match="not millimetres"):
+        with raises(InvalidValueError, "cloud_extent"):
             generator.sample(1000.0 * CLOUD, 9, 3)
     finally:
         generator.close()
 
 
 @needs("graspgenx")
-def test_the_network_is_told_the_z1_s_twelve_numbers_and_the_packages_stay_as_they_were(loaded):
+def test_the_network_is_conditioned_on_the_z1_and_the_packages_are_restored(loaded):
     import os
 
     from models.nvidia.graspgenx import sweep_numbers
 
     sampler = loaded("graspgenx")._sampler
-    with cuda_only_if_there():
-        told = sampler.load_gripper_input({})
-    np.testing.assert_allclose(told["sweep_volume_open_and_mid"], sweep_numbers(), atol=1e-6)
-    assert told["z_offset"].item() == pytest.approx(0.140)
+    with cuda_if_available():
+        conditioning = sampler.load_gripper_input({})
+    np.testing.assert_allclose(conditioning["sweep_volume_open_and_mid"], sweep_numbers(), atol=1e-6)
+    assert conditioning["z_offset"].item() == pytest.approx(0.140)
     assert "GRASPGENX_GRIPPER_CFG_DIR" not in os.environ and "pointnet2_ops" not in sys.modules
 
 
 @needs("graspgenx")
-def test_a_network_that_asks_for_more_of_the_gripper_than_there_is_is_refused(tmp_path):
+def test_a_network_with_an_unsupported_conditioning_is_rejected(tmp_path):
     from tests.support.nvidia_checkpoints import write_graspgenx
 
     folder = write_graspgenx(tmp_path / "points", gripper_backbone="pointnet_repr")
-    with pytest.raises(GeneratorError, match="conditioned on the gripper's 'pointnet_repr'"):
-        load_here("graspgenx", folder)
+    with raises(GeneratorError, "unsupported_conditioning"):
+        load_in_process("graspgenx", folder)
 
 
 @needs("graspgenx")
@@ -183,26 +185,26 @@ def test_a_graspgenx_with_a_pointnet_encoder_runs_without_compiled_ops(tmp_path)
     from tests.support.nvidia_checkpoints import write_graspgenx
 
     folder = write_graspgenx(tmp_path / "pointnet", backbone="pointnet")
-    assert len(load_here("graspgenx", folder).sample(CLOUD, 5, 0)) == 5
+    assert len(load_in_process("graspgenx", folder).sample(CLOUD, 5, 0)) == 5
 
 
 @needs("grasp_gen")
 @pytest.mark.parametrize(
-    ("damage", "message"),
+    ("damage", "code"),
     [
-        (lambda c: c["diffusion"].update(gripper_name="franka_panda"), "AssertionError"),
+        (lambda c: c["diffusion"].update(gripper_name="franka_panda"), "checkpoint_unreadable"),
         (
             lambda c: [c[k].update(gripper_name="robotiq_2f_85") for k in ("data", "diffusion", "discriminator")],
-            "2f_85",
+            "unknown_gripper",
         ),
-        (lambda c: c["eval"].update(model_name="m2t2"), "model 'm2t2'"),
-        (lambda c: c["eval"].update(checkpoint="other.pth"), "other.pth, which it names, is missing"),
-        (lambda c: c["diffusion"].update(diffusion_embed_dim=64), "size mismatch"),
-        (lambda c: c["discriminator"].update(checkpoint="text.pth"), r"cannot be loaded"),
-        (lambda c: c.pop("diffusion"), "cannot be loaded"),
+        (lambda c: c["eval"].update(model_name="m2t2"), "checkpoint_kind"),
+        (lambda c: c["eval"].update(checkpoint="other.pth"), "checkpoint_missing"),
+        (lambda c: c["diffusion"].update(diffusion_embed_dim=64), "checkpoint_unreadable"),
+        (lambda c: c["discriminator"].update(checkpoint="text.pth"), "checkpoint_unreadable"),
+        (lambda c: c.pop("diffusion"), "checkpoint_unreadable"),
     ],
 )
-def test_a_damaged_graspgen_checkpoint_is_refused_with_its_name(damage, message, checkpoints, tmp_path):
+def test_a_damaged_graspgen_checkpoint_is_rejected_with_its_name(damage, code, checkpoints, tmp_path):
     source = checkpoints("graspgen")
     for name in ("gen.pth", "dis.pth"):
         shutil.copy(source.with_name(name), tmp_path)
@@ -211,25 +213,26 @@ def test_a_damaged_graspgen_checkpoint_is_refused_with_its_name(damage, message,
     damage(config)
     path = tmp_path / "damaged.yml"
     path.write_text(yaml.safe_dump(config))
-    with pytest.raises(GeneratorError, match=message) as caught:
-        load_here("graspgen", path)
+    with raises(GeneratorError, code) as caught:
+        load_in_process("graspgen", path)
     assert "damaged.yml" in str(caught.value)
 
 
 @needs("graspgenx")
-def test_half_a_graspgenx_release_is_refused(checkpoints, tmp_path):
+def test_an_incomplete_graspgenx_release_is_rejected(checkpoints, tmp_path):
     shutil.copytree(checkpoints("graspgenx") / "gen", tmp_path / "gen")
-    with pytest.raises(GeneratorError, match=r"dis/config.yaml is missing"):
-        load_here("graspgenx", tmp_path)
+    with raises(GeneratorError, "checkpoint_missing"):
+        load_in_process("graspgenx", tmp_path)
 
 
 @pytest.mark.parametrize(("name", "package"), [("graspgen", "grasp_gen"), ("graspgenx", "graspgenx")])
-def test_a_missing_package_is_told_with_how_to_get_it(name, package, tmp_path):
+def test_a_missing_package_is_reported_with_its_installation(name, package, tmp_path):
     if importlib.util.find_spec(package) is not None:
         pytest.skip(f"{package} is installed")
     (tmp_path / "x.yml").write_text("{}")
     for part in ("gen", "dis"):
         (tmp_path / part).mkdir()
         (tmp_path / part / "config.yaml").write_text("{}")
-    with pytest.raises(GeneratorError, match=f"--extra {name}"):
-        load_here(name, tmp_path / "x.yml" if name == "graspgen" else tmp_path)
+    with raises(GeneratorError, "package_missing") as caught:
+        load_in_process(name, tmp_path / "x.yml" if name == "graspgen" else tmp_path)
+    assert f"--extra {name}" in str(caught.value)

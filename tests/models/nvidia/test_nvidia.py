@@ -1,4 +1,4 @@
-"""What turns NVIDIA's samplers into ours, tested without their packages: frames, order, ops, folding, device."""
+"""NVIDIA's samplers as generators, without their packages: frames, order, ops, folding, device."""
 
 from __future__ import annotations
 
@@ -7,27 +7,30 @@ import pytest
 import torch
 from torch import nn
 
+from hal.base import z1_gripper
+from hal.base.errors import InvalidValueError
 from models.factory import GeneratorOptions, generator_for, make_generator, split_generator_name
 from models.nvidia import pointnet_ops
 from models.nvidia.errors import GeneratorError
 from models.nvidia.graspgenx import Z1_GRIPPER, sweep_numbers
 from models.nvidia.nvidia import NvidiaSampler, make_nvidia_generator
-from models.nvidia.torch_patches import compiled_ops_replaced, cuda_only_if_there, drawn_from, fold_attention
-from z1_runtime.geometry import gripper_geometry
+from models.nvidia.torch_patches import cuda_if_available, fold_attention, replace_compiled_ops, seed_random_numbers
+from models.weights_file import WeightsError
+from tests.support.errors import raises
 
 CLOUD = np.random.default_rng(0).uniform([-0.03, -0.05, 0.38], [0.03, 0.05, 0.42], (500, 3))
 DEPTH_M = 0.195
 
 
-class TheirSampler:
-    """Gives the poses it was told to, with scores in no order, for a cloud about the origin."""
+class FakeSampler:
+    """Sampler with given poses and unsorted scores, for a centred cloud."""
 
     def __init__(self, T: np.ndarray, scores: list[float]) -> None:
-        self.T, self.scores, self.seen = torch.from_numpy(T).float(), torch.tensor(scores), torch.zeros(0)
+        self.T, self.scores, self.cloud = torch.from_numpy(T).float(), torch.tensor(scores), torch.zeros(0)
 
     def sample(self, cloud, threshold, num_grasps, remove_outliers):
         assert not remove_outliers and threshold == -1.0
-        self.seen = cloud
+        self.cloud = cloud
         return self.T, self.scores, None
 
 
@@ -41,7 +44,7 @@ def test_their_base_that_closes_along_x_becomes_our_fingertips_that_close_along_
     T_base = np.eye(4)
     T_base[:3, :3] = [[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]  # closes along +y, approaches along +x
     T_base[:3, 3] = [-0.2, 0.01, 0.02]
-    theirs = TheirSampler(T_base[None], [0.5])
+    theirs = FakeSampler(T_base[None], [0.5])
     grasps = NvidiaSampler(theirs, tip(DEPTH_M), "theirs").sample(CLOUD, 1, 0)
     T = grasps.T_camera_grasps[0]
     center = CLOUD.mean(axis=0)
@@ -50,33 +53,33 @@ def test_their_base_that_closes_along_x_becomes_our_fingertips_that_close_along_
     np.testing.assert_allclose(np.linalg.det(T[:3, :3]), 1.0, atol=1e-6)
     np.testing.assert_allclose(T[:3, 3], np.add(center, [-0.2 + DEPTH_M, 0.01, 0.02]), atol=1e-6)
     np.testing.assert_array_equal(T[3], [0.0, 0.0, 0.0, 1.0])
-    np.testing.assert_allclose(theirs.seen.mean(dim=0), 0.0, atol=1e-6)
+    np.testing.assert_allclose(theirs.cloud.mean(dim=0), 0.0, atol=1e-6)
     assert np.isnan(grasps.widths_m).all()
 
 
-def test_all_grasps_come_best_first_in_whatever_order_theirs_were():
+def test_all_grasps_are_returned_best_first():
     T = np.tile(np.eye(4), (3, 1, 1))
     T[:, 0, 3] = [0.0, 1.0, 2.0]
     T[:, 3, 3] = 0.0  # as GraspGenX leaves it
-    grasps = NvidiaSampler(TheirSampler(T, [0.2, 0.9, 0.4]), tip(0.0), "theirs").sample(CLOUD, 3, 0)
+    grasps = NvidiaSampler(FakeSampler(T, [0.2, 0.9, 0.4]), tip(0.0), "theirs").sample(CLOUD, 3, 0)
     assert grasps.scores == pytest.approx([0.9, 0.4, 0.2])
     offsets = grasps.T_camera_grasps[:, 0, 3] - CLOUD.mean(axis=0)[0]
     assert offsets == pytest.approx([1.0, 2.0, 0.0], abs=1e-6)
 
 
 @pytest.mark.parametrize("bad", ["short", "nan"])
-def test_networks_that_give_no_numbers_are_told_of(bad: str):
+def test_too_few_or_non_finite_grasps_are_rejected(bad: str):
     T = np.tile(np.eye(4), (3, 1, 1))
     if bad == "nan":
         T[1, 0, 3] = np.nan
-    sampler = NvidiaSampler(TheirSampler(T, [0.2, 0.9, 0.4]), tip(0.0), "theirs")
-    with pytest.raises(GeneratorError, match="checkpoint whole"):
+    sampler = NvidiaSampler(FakeSampler(T, [0.2, 0.9, 0.4]), tip(0.0), "theirs")
+    with raises(GeneratorError, "bad_output"):
         sampler.sample(CLOUD, 4 if bad == "short" else 3, 0)
 
 
-def test_a_cloud_in_millimetres_does_not_reach_them():
-    sampler = NvidiaSampler(TheirSampler(np.eye(4)[None], [1.0]), tip(0.0), "theirs")
-    with pytest.raises(ValueError, match="not millimetres"):
+def test_a_cloud_in_millimetres_is_rejected_before_sampling():
+    sampler = NvidiaSampler(FakeSampler(np.eye(4)[None], [1.0]), tip(0.0), "theirs")
+    with raises(InvalidValueError, "cloud_extent"):
         sampler.sample(1000.0 * CLOUD, 1, 0)
 
 
@@ -92,11 +95,11 @@ def test_attention_to_one_token_folds_into_the_same_linear_map():
         assert fold_attention(layers) == 1
         assert layers["attn"](q, k, v, attn_mask=None)[0] == pytest.approx(expected, abs=1e-5)
     assert sum(p.numel() for p in layers["attn"].parameters()) == 96 * 97
-    with pytest.raises(RuntimeError, match="2 tokens"):
+    with pytest.raises(RuntimeError):
         layers["attn"](q, k, torch.randn(2, 50, 96))
 
 
-def test_attention_that_is_more_than_that_is_left_alone():
+def test_other_attention_is_unchanged():
     layers = nn.ModuleList(
         [nn.MultiheadAttention(8, 2, batch_first=True), nn.MultiheadAttention(8, 2, add_zero_attn=True)]
     )
@@ -111,7 +114,7 @@ def test_sampling_takes_the_furthest_point_each_time_and_none_near_the_origin():
     assert pointnet_ops.furthest_point_sampling(only_near, 3).tolist() == [[0, 0, 0]]
 
 
-def test_the_ops_agree_with_their_definition_written_in_loops():
+def test_the_ops_equal_their_definition_in_loops():
     rng = np.random.default_rng(3)
     points = rng.uniform(-0.3, 0.3, (2, 80, 3)).astype(np.float32)
     centers, features = points[:, :9], rng.normal(size=(2, 5, 80)).astype(np.float32)
@@ -139,14 +142,14 @@ def test_an_empty_ball_and_one_larger_than_the_cloud_are_filled():
 @pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has CUDA: nothing is patched")
 def test_cuda_calls_do_nothing_within_and_are_restored_after():
     kept = torch.Tensor.cuda, nn.Module.cuda
-    with pytest.raises(KeyError), cuda_only_if_there():
+    with pytest.raises(KeyError), cuda_if_available():
         assert torch.zeros(2).cuda().device.type == "cpu"
         assert nn.Linear(2, 2).cuda().weight.device.type == "cpu"
         raise KeyError
     assert (torch.Tensor.cuda, nn.Module.cuda) == kept
 
 
-def test_their_random_numbers_begin_at_the_seed_and_ours_go_on_undisturbed():
+def test_random_numbers_within_are_seeded_and_continue_after():
     torch.manual_seed(5)
     np.random.seed(5)
     expected = torch.rand(1), np.random.rand()
@@ -154,14 +157,14 @@ def test_their_random_numbers_begin_at_the_seed_and_ours_go_on_undisturbed():
     np.random.seed(5)
     drawn = []
     for _ in range(2):
-        with drawn_from(9):
+        with seed_random_numbers(9):
             drawn.append((torch.rand(1), np.random.rand()))
     assert drawn[0] == drawn[1]
     assert (torch.rand(1), np.random.rand()) == expected
 
 
-def test_the_compiled_ops_are_stood_in_for_only_while_asked():
-    with compiled_ops_replaced():
+def test_the_compiled_ops_are_replaced_within_only():
+    with replace_compiled_ops():
         from pointnet2_ops import _ext  # type: ignore[import-not-found]
 
         assert _ext is pointnet_ops
@@ -169,77 +172,71 @@ def test_the_compiled_ops_are_stood_in_for_only_while_asked():
         import pointnet2_ops  # type: ignore[import-not-found]  # noqa: F401
 
 
-def test_the_z1_s_twelve_numbers_are_those_of_its_measured_beak():
-    to_axis_m = 0.049  # GripperStator to jointGripper in the URDF
+def test_the_z1_s_description_is_made_from_its_measured_gripper():
+    opened = 2.0 * np.arcsin(0.065 / 2.0 / z1_gripper.KNEE_RADIUS_M)  # both knees touch 65 mm
+    to_axis_m = -z1_gripper.T_PIVOT_STATIONARY_JAW[0, 3]
     boxes = []
-    opened = 2.0 * np.arcsin(0.065 / 2.0 / gripper_geometry.KNEE_RADIUS_M)  # both knees touch 65 mm
     for angle in (opened, opened / 2.0):
-        between_knees = 2.0 * gripper_geometry.KNEE_RADIUS_M * np.sin(angle / 2.0)
-        tips = to_axis_m + gripper_geometry.JAW_REACH_M * np.cos(angle / 2.0)
-        palm = to_axis_m + gripper_geometry.PALM_RADIUS_M
-        boxes += [between_knees, 2.0 * gripper_geometry.PAD_HALF_WIDTH_M, tips - palm, 0.0, 0.0, (tips + palm) / 2.0]
+        between_knees = 2.0 * z1_gripper.KNEE_RADIUS_M * np.sin(angle / 2.0)
+        tips = to_axis_m + z1_gripper.JAW_REACH_M * np.cos(angle / 2.0)
+        palm = to_axis_m + z1_gripper.PALM_RADIUS_M
+        boxes += [between_knees, 2.0 * z1_gripper.PAD_HALF_WIDTH_M, tips - palm, 0.0, 0.0, (tips + palm) / 2.0]
     assert sweep_numbers() == pytest.approx(boxes, abs=6e-4)
-    assert Z1_GRIPPER["open"]["jointGripper"] == pytest.approx(-opened, abs=0.01)
-    volume = Z1_GRIPPER["sweep_volume"]
-    assert Z1_GRIPPER["fingertip"][2] == pytest.approx(volume["offset"][2] + volume["extents"][2] / 2.0)
-    assert Z1_GRIPPER["bbox"][1][2] == pytest.approx(to_axis_m + gripper_geometry.JAW_REACH_M)
 
 
-def test_the_urdf_has_the_mover_s_axis_where_the_description_has_it():
-    from xml.etree import ElementTree
-
-    from hal.base import z1
-
-    joint = ElementTree.parse(z1.urdf_path()).find(".//joint[@name='jointGripper']/origin")
-    assert joint is not None
-    assert [float(v) for v in joint.get("xyz", "").split()] == pytest.approx([0.049, 0.0, 0.0])
+def test_the_z1_s_description_is_the_one_that_was_evaluated():
+    assert sweep_numbers().tolist() == [0.065, 0.052, 0.058, 0.0, 0.0, 0.111, 0.033, 0.052, 0.065, 0.0, 0.0, 0.114]
+    assert Z1_GRIPPER["open"] == {"jointGripper": -0.88}
+    assert Z1_GRIPPER["fingertip"] == [0.0, 0.0, 0.140]
+    assert Z1_GRIPPER["bbox"] == [[-0.05, -0.041, 0.0], [0.05, 0.041, 0.149]]
 
 
 def test_names_and_unions_are_checked():
     assert split_generator_name("union:obb_sweep+diffusion") == ("obb_sweep", "diffusion")
-    with pytest.raises(ValueError, match="no generator 'x'; known"):
+    with raises(InvalidValueError, "unknown_generator"):
         split_generator_name("union:obb_sweep+x")
-    for lonely in ("union:obb_sweep", "union:obb_sweep+obb_sweep"):
-        with pytest.raises(ValueError, match="two or more different"):
-            split_generator_name(lonely)
+    for single in ("union:obb_sweep", "union:obb_sweep+obb_sweep"):
+        with raises(InvalidValueError, "union_members"):
+            split_generator_name(single)
 
 
-def test_weights_alone_tell_whose_they_are(tmp_path):
+def test_the_kind_of_weights_gives_the_generator(tmp_path):
     assert generator_for(tmp_path) == "graspgenx"
     assert generator_for(tmp_path / "graspgen_franka_panda.yml") == "graspgen"
     assert generator_for(tmp_path / "mine.npz") == "diffusion"
-    with pytest.raises(ValueError, match="no grasp generator has weights like"):
+    with raises(InvalidValueError, "unknown_weights"):
         generator_for(tmp_path / "yolov8n.pt")
 
 
-def test_weights_go_to_the_one_member_that_takes_them(tmp_path):
+def test_weights_go_to_the_member_that_needs_them(tmp_path):
     options = GeneratorOptions(weights=tmp_path / "x.yml")
-    with pytest.raises(ValueError, match="takes no weights"):
+    with raises(InvalidValueError, "generator_weights"):
         make_generator("union:antipodal+obb_sweep", options)
-    with pytest.raises(ValueError, match="2 members"):
+    with raises(InvalidValueError, "generator_weights"):
         make_generator("union:graspgen+graspgenx", options)
-    with pytest.raises(ValueError, match="missing"):
+    with raises(WeightsError, "weights_missing"):
         make_generator("diffusion", options)
-    with pytest.raises(GeneratorError, match="comes without weights"):
+    with raises(GeneratorError, "no_weights"):
         make_generator("union:obb_sweep+graspgen")
-    with pytest.raises(ValueError, match="allowed is in"):
+    with raises(InvalidValueError, "generator_process"):
         GeneratorOptions(process="other")  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("name", ["graspgen", "graspgenx"])
-def test_a_checkpoint_that_is_not_there_and_a_python_that_is_not_are_told(name: str, tmp_path):
-    with pytest.raises(GeneratorError, match=r"not there|is missing"):
+def test_a_missing_checkpoint_and_a_missing_python_are_reported(name: str, tmp_path):
+    with raises(GeneratorError, "checkpoint_missing"):
         make_nvidia_generator(name, tmp_path / "none.yml", own_process=False)
-    with pytest.raises(GeneratorError, match=f"make_generator_env {name}"):
+    with raises(GeneratorError, "python_missing") as caught:
         make_nvidia_generator(name, tmp_path / "none.yml", own_process=True, python=tmp_path / "python")
+    assert f"make_generator_env {name}" in str(caught.value)
 
 
-def test_the_licence_is_said_once(caplog, tmp_path):
-    from models.nvidia.graspgen import say_licence_once
+def test_the_licence_is_logged_once(caplog, tmp_path):
+    from models.nvidia.graspgen import log_licence_once
 
-    say_licence_once.cache_clear()
+    log_licence_once.cache_clear()
     for _ in range(2):
-        with pytest.raises(GeneratorError):
+        with raises(GeneratorError, "checkpoint_missing"):
             make_nvidia_generator("graspgen", tmp_path / "none.yml", own_process=False)
     assert [r.levelname for r in caplog.records] == ["WARNING"]
     assert "no commercial use" in caplog.text

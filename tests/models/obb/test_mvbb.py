@@ -8,9 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from hal.base.errors import InvalidValueError
 from models.obb.mvbb import FitMethod, fit_obb, nearest_faces, rank_by_score, rank_grasps
 from models.obb.obb import DegenerateCloudError, OrientedBox
 from models.types import GraspSet
+from tests.support.errors import raises
 
 METHODS: tuple[FitMethod, ...] = ("pca", "min_volume", "upright")
 UP = np.array([0.0, -1.0, 0.0])
@@ -26,7 +28,7 @@ def make_solid(rng: np.random.Generator, half: np.ndarray, n: int = 600) -> np.n
 def make_upright_view(
     rng: np.random.Generator, half: np.ndarray, yaw_rad: float, position: np.ndarray, noise_m: float = 7e-4
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return what a level camera sees (4000, 3) of an upright box (y down is height), and its rotation (3, 3)."""
+    """Return the points (4000, 3) of an upright box in a level camera (y is down), and its rotation (3, 3)."""
     R = Rotation.from_euler("y", yaw_rad).as_matrix()
     normals = np.concatenate([R.T, -R.T])
     centers = position + normals * np.tile(half, 2)[:, None]
@@ -77,8 +79,8 @@ def test_faces_of_a_known_box_have_their_true_centers_and_outward_normals():
     np.testing.assert_allclose(box.corners_m[-1], [0.02, 0.05, 0.43])
 
 
-def test_a_box_refuses_arrays_of_the_wrong_shape():
-    with pytest.raises(ValueError, match="OrientedBox wants"):
+def test_a_box_rejects_arrays_of_the_wrong_shape():
+    with raises(InvalidValueError, "shape"):
         OrientedBox(T_camera_box=np.eye(3), half_extents_m=np.ones(3), unobserved=np.zeros(3, bool))
 
 
@@ -211,25 +213,26 @@ BAD_CLOUDS = {
 
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("cloud", BAD_CLOUDS.values(), ids=BAD_CLOUDS)
-def test_a_degenerate_cloud_is_refused_with_its_own_error(cloud: np.ndarray, method: FitMethod):
-    with pytest.raises(DegenerateCloudError):
+def test_a_degenerate_cloud_raises_its_own_error(cloud: np.ndarray, method: FitMethod):
+    with raises(DegenerateCloudError, "degenerate_cloud"):
         fit_obb(cloud, method, up=UP)
 
 
-def test_unusable_arguments_are_refused():
+def test_unusable_arguments_are_rejected():
     points = make_solid(np.random.default_rng(0), np.full(3, 0.05))
-    with pytest.raises(ValueError, match="needs `up`"):
+    with raises(InvalidValueError, "up"):
         fit_obb(points, "upright")
-    with pytest.raises(ValueError, match="not zero"):
+    with raises(InvalidValueError, "up"):
         fit_obb(points, up=np.zeros(3))
-    with pytest.raises(ValueError, match="Unknown box method"):
+    with raises(InvalidValueError, "box_method"):
         fit_obb(points, "minimum")  # pyright: ignore[reportArgumentType]
-    with pytest.raises(ValueError, match="percentile"):
+    with raises(InvalidValueError, "percentile"):
         fit_obb(points, percentile=(99, 1))
-    with pytest.raises(ValueError, match="1 to 6"):
+    with raises(InvalidValueError, "face_count"):
         nearest_faces(make_box(), 7)
-    with pytest.raises(ValueError, match="alpha"):
+    with raises(InvalidValueError, "alpha") as caught:
         rank_grasps(make_random_grasps(np.random.default_rng(0)), make_box(), alpha=1.5)
+    assert "1.5" in str(caught.value) and "0 to 1" in str(caught.value)
 
 
 def test_nearest_faces_are_those_with_the_nearest_true_centers():
@@ -238,7 +241,7 @@ def test_nearest_faces_are_those_with_the_nearest_true_centers():
     assert sorted(nearest_faces(make_box(), 6).tolist()) == [0, 1, 2, 3, 4, 5]
 
 
-def test_the_never_seen_back_of_a_one_face_view_is_no_near_face():
+def test_the_unobserved_back_of_a_one_face_view_is_the_farthest_face():
     cloud, _ = make_upright_view(np.random.default_rng(1), np.array([0.03, 0.08, 0.05]), 0.0, np.array([0, 0, 0.4]))
     box = fit_obb(cloud, up=UP)
     faces = nearest_faces(box, 6)
@@ -295,7 +298,7 @@ def test_alpha_one_ranks_by_alignment_and_alpha_zero_by_score():
     assert (np.diff(by_score.grasps.scores) <= 0).all()
 
 
-def test_a_ranking_by_other_scores_keeps_what_belongs_together():
+def test_a_ranking_by_other_scores_keeps_the_rows_together():
     ranked = rank_grasps(make_random_grasps(np.random.default_rng(7)), make_box())
     other = np.random.default_rng(8).random(len(ranked))
     again = ranked.reordered(other)
@@ -307,9 +310,9 @@ def test_a_ranking_by_other_scores_keeps_what_belongs_together():
     np.testing.assert_array_equal(again.grasps.T_camera_grasps, ranked.grasps.T_camera_grasps[order])
 
 
-def test_no_survivor_gives_an_empty_ranking():
-    away = make_grasps(np.array([[0.0, 0.0, -1.0], [0.0, 0.1, -1.0]]), np.array([0.1, 0.9]))
-    ranked = rank_grasps(away, make_box(), k=1)
+def test_without_accepted_grasps_the_ranking_is_empty():
+    backward = make_grasps(np.array([[0.0, 0.0, -1.0], [0.0, 0.1, -1.0]]), np.array([0.1, 0.9]))
+    ranked = rank_grasps(backward, make_box(), k=1)
     assert len(ranked) == len(ranked.grasps) == len(ranked.scores) == len(ranked.alignments) == 0
 
 

@@ -1,4 +1,4 @@
-"""The antipodal sampler, on what one camera sees of a cylinder and of a box."""
+"""The antipodal sampler, on single views of a cylinder and of a box."""
 
 from __future__ import annotations
 
@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from hal.base.errors import InvalidValueError
 from models.obb.mvbb import fit_obb, rank_grasps
 from models.samplers.antipodal import AntipodalConfig, AntipodalSampler
-from models.samplers.surfels import estimate_normals, find_outline, guess_hidden_sides
+from models.samplers.surfels import estimate_normals, estimate_occluded_sides, find_outline
 from models.types import GraspSet
+from tests.support.errors import raises
 
 UP = np.array([0.0, -1.0, 0.0])
 CENTER = np.array([0.02, 0.01, 0.4])
@@ -43,12 +45,12 @@ def cylinder_grasps() -> GraspSet:
 
 
 @pytest.mark.parametrize("n", [1, 7, 800])
-def test_exactly_as_many_grasps_come_as_were_asked_for(n: int):
+def test_exactly_the_requested_number_of_grasps_is_returned(n: int):
     grasps = AntipodalSampler().sample(make_cylinder_view(), n, seed=3)
     assert len(grasps) == n and grasps.T_camera_grasps.shape == (n, 4, 4)
 
 
-def test_every_grasp_is_a_rigid_pose_with_a_score_and_a_width_the_jaw_has(cylinder_grasps: GraspSet):
+def test_every_grasp_is_a_rigid_pose_with_a_score_and_a_width_within_the_opening(cylinder_grasps: GraspSet):
     R = cylinder_grasps.T_camera_grasps[:, :3, :3]
     np.testing.assert_allclose(R.transpose(0, 2, 1) @ R, np.tile(np.eye(3), (len(R), 1, 1)), atol=1e-9)
     np.testing.assert_allclose(np.linalg.det(R), 1.0)
@@ -66,7 +68,7 @@ def test_the_same_seed_gives_the_same_grasps_and_another_seed_others():
     assert not np.allclose(first.T_camera_grasps, other.T_camera_grasps)
 
 
-def test_a_cylinder_seen_from_the_front_is_held_across_its_axis(cylinder_grasps: GraspSet):
+def test_a_cylinder_viewed_from_the_front_is_held_across_its_axis(cylinder_grasps: GraspSet):
     frontal = cylinder_grasps[cylinder_grasps.T_camera_grasps[:, 2, 2] > np.cos(np.pi / 4)]
     assert len(frontal) > 40
     closing = frontal.T_camera_grasps[:, :3, 1]
@@ -91,7 +93,7 @@ def test_a_flat_front_is_held_by_its_hidden_sides():
     assert np.median(fingertips_behind_the_face) > 0.005
 
 
-def test_most_hands_stay_clear_of_the_visible_points(cylinder_grasps: GraspSet):
+def test_most_grasps_are_clear_of_the_visible_points(cylinder_grasps: GraspSet):
     cloud = make_cylinder_view()
     clear = []
     for T, width_m in zip(cylinder_grasps.T_camera_grasps[:100], cylinder_grasps.widths_m[:100], strict=True):
@@ -119,35 +121,35 @@ def test_turning_the_camera_turns_the_grasps():
 
 
 BAD_CLOUDS = {
-    "empty": np.zeros((0, 3)),
-    "29 points": make_cylinder_view(n=29),
-    "nan": np.vstack([make_cylinder_view(), [[np.nan, 0.0, 0.4]]]),
-    "infinite": np.vstack([make_cylinder_view(), [[0.0, np.inf, 0.4]]]),
-    "two columns": np.ones((100, 2)),
-    "one place": np.full((100, 3), 0.4),
-    "behind the camera": make_cylinder_view() - [0.0, 0.0, 0.4],
-    "wider than the jaw": make_front_view() * 4.0,
+    "empty": (np.zeros((0, 3)), "cloud_points"),
+    "29 points": (make_cylinder_view(n=29), "cloud_points"),
+    "nan": (np.vstack([make_cylinder_view(), [[np.nan, 0.0, 0.4]]]), "cloud_not_finite"),
+    "infinite": (np.vstack([make_cylinder_view(), [[0.0, np.inf, 0.4]]]), "cloud_not_finite"),
+    "two columns": (np.ones((100, 2)), "cloud_points"),
+    "one place": (np.full((100, 3), 0.4), "no_grasps"),
+    "behind the camera": (make_cylinder_view() - [0.0, 0.0, 0.4], "cloud_behind_camera"),
+    "wider than the gripper": (make_front_view() * 4.0, "no_grasps"),
 }
 
 
-@pytest.mark.parametrize("cloud", BAD_CLOUDS.values(), ids=BAD_CLOUDS)
-def test_a_cloud_without_grasps_is_refused(cloud: np.ndarray):
-    with pytest.raises(ValueError):
+@pytest.mark.parametrize(("cloud", "code"), BAD_CLOUDS.values(), ids=BAD_CLOUDS)
+def test_a_cloud_without_grasps_is_rejected(cloud: np.ndarray, code: str):
+    with raises(InvalidValueError, code):
         AntipodalSampler().sample(cloud, 100, seed=0)
 
 
-def test_unusable_settings_are_refused():
-    with pytest.raises(ValueError, match="max_width_m"):
+def test_unusable_settings_are_rejected():
+    with raises(InvalidValueError, "gripper_width"):
         AntipodalConfig(max_width_m=0.001)
-    with pytest.raises(ValueError, match="finger_length_m"):
+    with raises(InvalidValueError, "gripper_depth"):
         AntipodalConfig(max_depth_m=0.06)
-    with pytest.raises(ValueError, match="oversampling"):
+    with raises(InvalidValueError, "sampling"):
         AntipodalConfig(oversampling=0.5)
-    with pytest.raises(ValueError, match="ask for one or more"):
+    with raises(InvalidValueError, "grasp_count"):
         AntipodalSampler().sample(make_cylinder_view(), 0, seed=0)
 
 
-def test_a_narrower_jaw_gives_no_wider_grasp():
+def test_a_narrower_gripper_gives_no_wider_grasp():
     grasps = AntipodalSampler(AntipodalConfig(max_width_m=0.05)).sample(make_front_view(), 100, seed=0)
     assert grasps.widths_m.max() <= 0.05
 
@@ -177,6 +179,6 @@ def test_the_side_behind_a_flat_edge_is_square_to_the_face_and_behind_it():
 
     cloud = make_front_view()
     rim, outward = find_outline(cloud)
-    sides = guess_hidden_sides(cloud, KDTree(cloud), rim, outward, 0.008)
+    sides = estimate_occluded_sides(cloud, KDTree(cloud), rim, outward, 0.008)
     assert np.median(np.abs(sides.normals[:, 2])) < np.sin(np.deg2rad(5))
     assert np.median(sides.points[:, 2] - cloud[rim, 2]) == pytest.approx(0.008, abs=1e-3)

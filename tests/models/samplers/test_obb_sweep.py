@@ -1,4 +1,4 @@
-"""Sweeps over the faces of a box: on a box, a bottle-like lathe shape, and on what no jaw can hold."""
+"""Sweeps over the faces of a box: on boxes and cylinders, and on clouds without grasps."""
 
 from __future__ import annotations
 
@@ -8,10 +8,15 @@ import sys
 import numpy as np
 import pytest
 
-from models.diffusion.training.labels import GRIPPERS, check_grasps
+from hal.base.errors import InvalidValueError, Z1Error
+from hal.base.transforms import inverse
+from models.diffusion.training.grippers import GRIPPERS
+from models.diffusion.training.labels import check_grasps
 from models.diffusion.training.shapes import make_shape
 from models.diffusion.training.views import ViewConfig, render_view
-from models.samplers.obb_sweep import ObbSweepConfig, ObbSweepSampler, fit_snug_box
+from models.obb.obb import DegenerateCloudError
+from models.samplers.obb_sweep import ObbSweepConfig, ObbSweepSampler, fit_tightest_box
+from tests.support.errors import raises
 
 HALF = np.array([0.03, 0.09, 0.05])
 CENTER = np.array([0.02, -0.01, 0.45])
@@ -33,7 +38,7 @@ def yaw(angle: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("n", [1, 7, 800])
-def test_exactly_as_many_rigid_grasps_come_as_were_asked_for(n: int):
+def test_exactly_the_requested_number_of_rigid_grasps_is_returned(n: int):
     grasps = ObbSweepSampler().sample(corner_view(), n, seed=3)
     R = grasps.T_camera_grasps[:, :3, :3]
     assert len(grasps) == n
@@ -53,7 +58,7 @@ def test_the_same_seed_gives_the_same_grasps_and_another_seed_others():
 
 
 def test_two_side_faces_give_a_box_along_them_and_not_along_their_hypotenuse():
-    box = fit_snug_box(corner_view())
+    box = fit_tightest_box(corner_view())
     cosines = np.abs(box.R_camera_box.T @ yaw(0.6))
     assert cosines.max(axis=0).min() > np.cos(np.deg2rad(2.0))
 
@@ -76,47 +81,47 @@ def test_the_sweep_reaches_all_of_a_face_and_many_depths():
     assert np.ptp(local[:, 2]) > 0.04
 
 
-def test_no_grasp_comes_from_behind():
+def test_no_grasp_approaches_from_behind():
     grasps = ObbSweepSampler().sample(corner_view(), 400, seed=0)
     assert grasps.T_camera_grasps[:, 2, 2].min() > -0.8
 
 
-def test_most_grasps_of_boxes_and_cylinders_really_hold():
-    shares = []
+def test_most_grasps_of_boxes_and_cylinders_are_valid():
+    valid = []
     for seed in range(6):
         rng = np.random.default_rng(500 + seed)
         solid = make_shape(("box", "cylinder")[seed % 2], rng)
-        seen = render_view(solid, ViewConfig(occluded_share=0.0), rng)
-        assert seen is not None
-        points, T_camera_object = seen
+        view = render_view(solid, ViewConfig(occluded_view_ratio=0.0), rng)
+        assert view is not None
+        points, T_camera_object = view
         grasps = ObbSweepSampler().sample(points, 150, 0)
-        check = check_grasps(solid, np.linalg.inv(T_camera_object) @ grasps.T_camera_grasps, GRIPPERS["agnostic"])
-        shares.append(check.valid.mean())
-    assert np.mean(shares) > 0.75
+        check = check_grasps(solid, inverse(T_camera_object) @ grasps.T_camera_grasps, GRIPPERS["agnostic"])
+        valid.append(check.valid.mean())
+    assert np.mean(valid) > 0.75
 
 
 BAD_CLOUDS = {
-    "empty": (np.zeros((0, 3)), "30 points"),
-    "nan": (np.vstack([corner_view(), [[np.nan, 0.0, 0.4]]]), "NaN"),
-    "millimetres": (1000.0 * corner_view(), "not millimetres"),
-    "one place": (np.full((100, 3), 0.4), "spans 0 m"),
-    "on a line": (np.linspace([0.0, 0.0, 0.4], [0.1, 0.0, 0.4], 100), "line"),
-    "too wide": (corner_view() * 3.0, "narrower on some side"),
+    "empty": (np.zeros((0, 3)), InvalidValueError, "cloud_points"),
+    "nan": (np.vstack([corner_view(), [[np.nan, 0.0, 0.4]]]), InvalidValueError, "cloud_not_finite"),
+    "millimetres": (1000.0 * corner_view(), InvalidValueError, "cloud_extent"),
+    "one place": (np.full((100, 3), 0.4), InvalidValueError, "cloud_extent"),
+    "on a line": (np.linspace([0.0, 0.0, 0.4], [0.1, 0.0, 0.4], 100), DegenerateCloudError, "degenerate_cloud"),
+    "too wide": (corner_view() * 3.0, InvalidValueError, "no_grasps"),
 }
 
 
-@pytest.mark.parametrize(("cloud", "message"), BAD_CLOUDS.values(), ids=BAD_CLOUDS)
-def test_a_cloud_without_grasps_is_refused(cloud: np.ndarray, message: str):
-    with pytest.raises(ValueError, match=message):
+@pytest.mark.parametrize(("cloud", "kind", "code"), BAD_CLOUDS.values(), ids=BAD_CLOUDS)
+def test_a_cloud_without_grasps_is_rejected(cloud: np.ndarray, kind: type[Z1Error], code: str):
+    with raises(kind, code):
         ObbSweepSampler().sample(cloud, 100, seed=0)
 
 
-def test_unusable_settings_and_counts_are_refused():
-    with pytest.raises(ValueError, match="max_depth_m"):
+def test_unusable_settings_and_counts_are_rejected():
+    with raises(InvalidValueError, "gripper_depth"):
         ObbSweepConfig(max_depth_m=0.08)
-    with pytest.raises(ValueError, match="oversampling"):
+    with raises(InvalidValueError, "sampling"):
         ObbSweepConfig(oversampling=0.5)
-    with pytest.raises(ValueError, match="ask for one or more"):
+    with raises(InvalidValueError, "grasp_count"):
         ObbSweepSampler().sample(corner_view(), 0, seed=0)
 
 

@@ -1,25 +1,28 @@
-"""A union of generators: all asked, all scored alike, near copies thinned."""
+"""A union of generators: all sampled, scored by one scorer, near duplicates thinned."""
 
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
+from hal.base.errors import InvalidValueError
+from hal.base.transforms import inverse
 from models.diffusion.sampler import DiffusionSampler
-from models.diffusion.training.labels import GRIPPERS, check_grasps
+from models.diffusion.training.grippers import GRIPPERS
+from models.diffusion.training.labels import check_grasps
 from models.diffusion.training.shapes import make_shape
 from models.diffusion.training.views import ViewConfig, render_view
 from models.factory import make_generator
 from models.samplers.antipodal import AntipodalSampler
 from models.samplers.obb_sweep import ObbSweepSampler
-from models.samplers.union import UnionSampler, find_copies
+from models.samplers.union import UnionSampler, find_duplicates
 from models.types import GraspSet
+from tests.support.errors import raises
 
 CLOUD = np.random.default_rng(0).uniform([-0.03, -0.05, 0.38], [0.03, 0.05, 0.42], (200, 3))
 
 
-class At:
-    """Proposes `n` grasps in a row from `start` along x."""
+class RowGenerator:
+    """Generator of `n` grasps in a row from `start` along x."""
 
     def __init__(self, start_m: float, step_m: float = 0.01, name: str = "at") -> None:
         self.start_m, self.step_m, self.name = start_m, step_m, name
@@ -30,26 +33,26 @@ class At:
         return GraspSet(T_camera_grasps=T, scores=np.ones(n), widths_m=np.full(n, 0.05), source=self.name)
 
 
-class Refuses:
+class EmptyGenerator:
     def sample(self, points: np.ndarray, n: int, seed: int) -> GraspSet:
-        raise ValueError("nothing to hold here")
+        raise InvalidValueError("nothing to hold here", code="no_grasps")
 
 
-class LikesRight:
-    """Scores by x alone, and counts what it was shown."""
+class ScoreByX:
+    """Scorer by x alone, with a count of its grasps."""
 
     def __init__(self) -> None:
-        self.shown = 0
+        self.count = 0
 
     def score(self, points: np.ndarray, grasps: GraspSet, seed: int) -> np.ndarray:
-        self.shown = len(grasps)
+        self.count = len(grasps)
         return 1.0 / (1.0 + np.exp(-grasps.T_camera_grasps[:, 0, 3]))
 
 
-def test_every_member_is_asked_for_all_and_the_best_by_one_judge_are_kept():
-    judge = LikesRight()
-    grasps = UnionSampler([At(0.0, name="a"), At(0.055, name="b")], judge).sample(CLOUD, 10, 0)
-    assert judge.shown == 20
+def test_every_member_samples_all_and_the_best_by_one_scorer_are_kept():
+    scorer = ScoreByX()
+    grasps = UnionSampler([RowGenerator(0.0, name="a"), RowGenerator(0.055, name="b")], scorer).sample(CLOUD, 10, 0)
+    assert scorer.count == 20
     assert len(grasps) == 10
     expected = np.sort(np.concatenate([0.01 * np.arange(10), 0.055 + 0.01 * np.arange(10)]))[::-1][:10]
     np.testing.assert_allclose(grasps.T_camera_grasps[:, 0, 3], expected)
@@ -57,46 +60,46 @@ def test_every_member_is_asked_for_all_and_the_best_by_one_judge_are_kept():
     assert grasps.source == "union:a+b"
 
 
-def test_of_near_copies_only_the_best_counts_as_long_as_there_are_others():
-    twins = UnionSampler([At(0.0), At(0.001)], LikesRight())
+def test_of_near_duplicates_only_the_best_counts_while_there_are_others():
+    twins = UnionSampler([RowGenerator(0.0), RowGenerator(0.001)], ScoreByX())
     grasps = twins.sample(CLOUD, 10, 0)
     np.testing.assert_allclose(grasps.T_camera_grasps[:, 0, 3], 0.001 + 0.01 * np.arange(10)[::-1])
 
 
-def test_copies_fill_up_where_there_is_nothing_else():
-    same = UnionSampler([At(0.0, step_m=0.0), At(0.0, step_m=0.0)], LikesRight())
+def test_duplicates_fill_up_without_other_grasps():
+    same = UnionSampler([RowGenerator(0.0, step_m=0.0), RowGenerator(0.0, step_m=0.0)], ScoreByX())
     assert len(same.sample(CLOUD, 8, 0)) == 8
 
 
-def test_a_hand_turned_over_is_a_copy_and_one_from_elsewhere_or_across_is_not():
-    here, over, across, other_way = (np.eye(4) for _ in range(4))
+def test_a_gripper_turned_over_is_a_duplicate_and_another_pose_is_not():
+    here, over, across, reversed_approach = (np.eye(4) for _ in range(4))
     over[:3, :3] = np.diag([-1.0, -1.0, 1.0])
     across[:3, :3] = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
-    other_way[:3, :3] = np.diag([1.0, -1.0, -1.0])
+    reversed_approach[:3, :3] = np.diag([1.0, -1.0, -1.0])
     far = np.eye(4)
     far[0, 3] = 0.004
     np.testing.assert_array_equal(
-        find_copies(np.stack([here, over, across, other_way, far])), [False, True, False, False, False]
+        find_duplicates(np.stack([here, over, across, reversed_approach, far])), [False, True, False, False, False]
     )
 
 
-def test_a_copy_of_a_copy_is_kept_when_it_is_no_copy_of_what_is_kept():
+def test_a_duplicate_of_a_dropped_grasp_alone_is_kept():
     row = np.tile(np.eye(4), (3, 1, 1))
     row[:, 0, 3] = [0.0, 0.002, 0.004]
-    np.testing.assert_array_equal(find_copies(row), [False, True, False])
+    np.testing.assert_array_equal(find_duplicates(row), [False, True, False])
 
 
-def test_a_member_without_grasps_is_passed_over_but_not_all_of_them():
-    assert len(UnionSampler([Refuses(), At(0.0)], LikesRight()).sample(CLOUD, 5, 0)) == 5
-    with pytest.raises(ValueError, match="nothing to hold"):
-        UnionSampler([Refuses(), Refuses()], LikesRight()).sample(CLOUD, 5, 0)
+def test_a_member_without_grasps_is_skipped_but_not_all_of_them():
+    assert len(UnionSampler([EmptyGenerator(), RowGenerator(0.0)], ScoreByX()).sample(CLOUD, 5, 0)) == 5
+    with raises(InvalidValueError, "no_grasps"):
+        UnionSampler([EmptyGenerator(), EmptyGenerator()], ScoreByX()).sample(CLOUD, 5, 0)
 
 
-def test_bad_clouds_and_lone_members_are_refused():
-    with pytest.raises(ValueError, match="not millimetres"):
-        UnionSampler([At(0.0), At(0.1)], LikesRight()).sample(1000.0 * CLOUD, 5, 0)
-    with pytest.raises(ValueError, match="two or more"):
-        UnionSampler([At(0.0)], LikesRight())
+def test_bad_clouds_and_single_members_are_rejected():
+    with raises(InvalidValueError, "cloud_extent"):
+        UnionSampler([RowGenerator(0.0), RowGenerator(0.1)], ScoreByX()).sample(1000.0 * CLOUD, 5, 0)
+    with raises(InvalidValueError, "union_members"):
+        UnionSampler([RowGenerator(0.0)], ScoreByX())
 
 
 def test_sweep_and_diffusion_together_hold_no_worse_than_the_sweep_alone():
@@ -107,13 +110,13 @@ def test_sweep_and_diffusion_together_hold_no_worse_than_the_sweep_alone():
     for seed, family in enumerate(("lathe", "cone", "cup")):
         rng = np.random.default_rng(70 + seed)
         solid = make_shape(family, rng)
-        seen = render_view(solid, ViewConfig(occluded_share=0.0), rng)
-        assert seen is not None
-        points, T_camera_object = seen
-        for generator, shares in ((union, joined), (union.members[0], alone)):
+        view = render_view(solid, ViewConfig(occluded_view_ratio=0.0), rng)
+        assert view is not None
+        points, T_camera_object = view
+        for generator, valid in ((union, joined), (union.members[0], alone)):
             grasps = generator.sample(points, 150, 0)
-            T = np.linalg.inv(T_camera_object) @ grasps.T_camera_grasps
-            shares.append(check_grasps(solid, T, GRIPPERS["agnostic"]).valid.mean())
+            T = inverse(T_camera_object) @ grasps.T_camera_grasps
+            valid.append(check_grasps(solid, T, GRIPPERS["agnostic"]).valid.mean())
         again = union.sample(points, 150, 0)
         np.testing.assert_array_equal(again.T_camera_grasps, union.sample(points, 150, 0).T_camera_grasps)
     assert np.mean(joined) >= np.mean(alone)

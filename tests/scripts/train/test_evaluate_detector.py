@@ -1,4 +1,4 @@
-"""How the detector is measured: a perfect one scores 1, and each kind of mistake costs."""
+"""Evaluation of the detector: a perfect one scores 1, and each kind of mistake lowers a figure."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from models.types import Detection
-from scripts.train.detection_measures import box_iou, mask_iou, match
 from scripts.train.evaluate_detector import label_file, measure_empty, measure_held_out
 from scripts.train.make_detection_dataset import read_labels, to_line
 from sim_twin.detection_data.scenes import Label
@@ -30,16 +29,16 @@ def detection(name: str, mask: np.ndarray, confidence: float) -> Detection:
 
 
 class Oracle:
-    """Knows the labels of the picture with a given brightness, and changes its answer by `spoil`."""
+    """Detector that gives the labels of the picture with a given brightness, changed by `corrupt`."""
 
-    def __init__(self, data: Path, spoil: Callable[[list[Detection]], list[Detection]]) -> None:
+    def __init__(self, data: Path, corrupt: Callable[[list[Detection]], list[Detection]]) -> None:
         self.config = SimpleNamespace(min_confidence=0.5)
         self._files = sorted((data / "images/val").glob("*/*.jpg"))
-        self._spoil = spoil
+        self._corrupt = corrupt
 
     def detect(self, image: np.ndarray, min_confidence: float | None = None) -> list[Detection]:
         labels = read_labels(label_file(self._files[round(float(image.mean()) / 20) - 1]), SHAPE)
-        return self._spoil([detection(label.name, label.mask, 0.9 - 0.1 * k) for k, label in enumerate(labels)])
+        return self._corrupt([detection(label.name, label.mask, 0.9 - 0.1 * k) for k, label in enumerate(labels)])
 
 
 @pytest.fixture
@@ -49,22 +48,22 @@ def data(tmp_path: Path) -> Path:
         [Label(name="cylinder", mask=rectangle(200, 200, 300, 400))],
         [Label(name="bottle", mask=rectangle(500, 60, 600, 200))],
     ]
-    for number, (look, there) in enumerate(zip(("twin", "own", "any"), labels, strict=True)):
+    for number, (look, objects) in enumerate(zip(("twin", "own", "any"), labels, strict=True)):
         name = f"{number}_{look}"
         image, file = tmp_path / f"images/val/1/{name}.jpg", tmp_path / f"labels/val/1/{name}.txt"
         for path in (image, file):
             path.parent.mkdir(parents=True, exist_ok=True)
         cv2.imwrite(str(image), np.full((*SHAPE, 3), 20 * (number + 1), np.uint8))
-        file.write_text("".join(to_line(label) + "\n" for label in there))
+        file.write_text("".join(to_line(label) + "\n" for label in objects))
     return tmp_path
 
 
-def measure(data: Path, spoil: Callable[[list[Detection]], list[Detection]]) -> dict[str, object]:
-    oracle = Oracle(data, spoil)
+def measure(data: Path, corrupt: Callable[[list[Detection]], list[Detection]]) -> dict[str, object]:
+    oracle = Oracle(data, corrupt)
     return measure_held_out(oracle, oracle, data, 500)  # pyright: ignore[reportArgumentType]
 
 
-def test_a_perfect_detector_has_full_marks(data: Path) -> None:
+def test_a_perfect_detector_has_maximum_figures(data: Path) -> None:
     figures = measure(data, lambda found: found)
     assert figures["box_map50"] == pytest.approx(0.995, abs=0.001)  # 101 points between recalls 0 and 1
     assert figures["mask_map50_95"] == pytest.approx(0.995, abs=0.001)
@@ -72,7 +71,7 @@ def test_a_perfect_detector_has_full_marks(data: Path) -> None:
     assert (figures["held_out_pictures"], figures["held_out_objects"]) == (3, 4)
 
 
-def test_wrong_names_and_masks_that_miss_cost(data: Path) -> None:
+def test_wrong_names_and_incomplete_masks_lower_the_figures(data: Path) -> None:
     def rename(found: list[Detection]) -> list[Detection]:
         return [replace(d, label="box") if d.label == "cylinder" else d for d in found]
 
@@ -90,24 +89,8 @@ def test_wrong_names_and_masks_that_miss_cost(data: Path) -> None:
 def test_a_box_in_an_empty_picture_is_counted_only_above_the_threshold(data: Path) -> None:
     (data / "images/val").rename(data / "images/empty")
     mask = rectangle(10, 10, 50, 50)
-    answers = iter([[detection("box", mask, 0.6)], [detection("box", mask, 0.3)], []])
-    judge = SimpleNamespace(config=SimpleNamespace(min_confidence=0.5), detect=lambda image, least: next(answers))
-    figures = measure_empty(judge, data)  # pyright: ignore[reportArgumentType]
+    replies = iter([[detection("box", mask, 0.6)], [detection("box", mask, 0.3)], []])
+    detector = SimpleNamespace(config=SimpleNamespace(min_confidence=0.5), detect=lambda image, minimum: next(replies))
+    figures = measure_empty(detector, data)  # pyright: ignore[reportArgumentType]
     assert (figures["empty_pictures"], figures["empty_with_false_box"]) == (3, 1)
     assert figures["empty_highest_confidence"] == 0.6
-
-
-def test_one_label_is_hit_once_and_by_the_surest() -> None:
-    mask = rectangle(100, 100, 200, 200)
-    found = [detection("box", mask, 0.9), detection("box", mask, 0.8)]
-    by_box, by_mask = match(found, (Label(name="box", mask=mask),))
-    assert by_box[0].all() and by_mask[0].all()
-    assert not by_box[1].any() and not by_mask[1].any()
-
-
-def test_overlaps_are_shared_over_joined() -> None:
-    a, b = rectangle(0, 0, 100, 100), rectangle(50, 0, 150, 100)
-    assert mask_iou(a, b) == pytest.approx(1 / 3)
-    assert box_iou(np.array([0, 0, 100, 100]), np.array([50, 0, 150, 100])) == pytest.approx(1 / 3)
-    assert box_iou(np.array([0, 0, 10, 10]), np.array([20, 20, 30, 30])) == 0.0
-    assert mask_iou(np.zeros(SHAPE, dtype=bool), np.zeros(SHAPE, dtype=bool)) == 0.0

@@ -1,4 +1,4 @@
-"""The detector's data on disk: labels survive the way to the file and back, and an interrupted run goes on."""
+"""The detector's data on disk: labels round-trip through files, and an interrupted run resumes."""
 
 import shutil
 from dataclasses import replace
@@ -28,7 +28,7 @@ def disc(*places: tuple[int, int, int]) -> np.ndarray:
 @pytest.mark.parametrize(
     "mask", [disc((300, 200, 60)), disc((5, 470, 40)), disc((200, 200, 50), (320, 210, 40), (450, 300, 30))]
 )
-def test_a_mask_survives_the_way_to_the_file_and_back(mask: np.ndarray, tmp_path: Path) -> None:
+def test_a_mask_round_trips_through_the_file(mask: np.ndarray, tmp_path: Path) -> None:
     file = tmp_path / "labels.txt"
     file.write_text(to_line(Label(name="cylinder", mask=mask)) + "\n")
     (back,) = read_labels(file, SHAPE)
@@ -37,10 +37,10 @@ def test_a_mask_survives_the_way_to_the_file_and_back(mask: np.ndarray, tmp_path
     assert np.abs(back.box() - Label(name="cylinder", mask=mask).box()).max() <= 1
 
 
-def test_a_line_is_a_class_number_and_shares_of_the_picture() -> None:
-    number, *shares = to_line(Label(name="box", mask=disc((630, 10, 30)))).split()
+def test_a_line_is_a_class_index_and_ratios_of_the_picture() -> None:
+    number, *ratios = to_line(Label(name="box", mask=disc((630, 10, 30)))).split()
     assert CLASSES[int(number)] == "box"
-    values = np.array(shares, dtype=float)
+    values = np.array(ratios, dtype=float)
     assert len(values) % 2 == 0 and values.min() >= 0.0 and values.max() <= 1.0
 
 
@@ -55,7 +55,7 @@ def test_a_picture_without_objects_has_no_labels(tmp_path: Path) -> None:
     assert read_labels(tmp_path / "empty.txt", SHAPE) == ()
 
 
-def test_splits_share_no_seed_and_hold_what_was_asked_for() -> None:
+def test_splits_share_no_seed_and_have_the_requested_sizes() -> None:
     shards = plan_shards(Config(train=250, val=30, empty=10, shard=100))
     assert len({shard.seed for shard in shards}) == len(shards)
     for split, count in (("train", 250), ("val", 30), ("empty", 10)):
@@ -64,7 +64,7 @@ def test_splits_share_no_seed_and_hold_what_was_asked_for() -> None:
     assert all(b - a > 100_000 for a, b in pairwise(sorted(SPLITS.values())))
 
 
-def test_a_second_run_makes_only_what_is_missing(tmp_path: Path) -> None:
+def test_a_second_run_makes_only_missing_shards(tmp_path: Path) -> None:
     try:
         open_egl(16, 16).free()
     except CameraError:
@@ -84,5 +84,5 @@ def test_a_second_run_makes_only_what_is_missing(tmp_path: Path) -> None:
     shutil.rmtree(tmp_path / "images/val/2000000")
     main(config)
     (again,) = (tmp_path / "images/val/2000000").glob("0000_*.jpg")
-    assert again.read_bytes() == first[again]  # a shard is its seed's
+    assert again.read_bytes() == first[again]  # a shard depends on its seed alone
     assert not list((tmp_path / "partial").iterdir())

@@ -1,4 +1,4 @@
-"""`scripts/train/train_detector.py`: what does not need hours."""
+"""`scripts/train/train_detector.py`: missing data, and the end of its processes."""
 
 from __future__ import annotations
 
@@ -9,14 +9,17 @@ from threading import Event
 
 import pytest
 
+from hal.base.errors import MissingFileError
 from scripts.train.train_detector import Config, end_with_parent, main
+from tests.support.errors import raises
 
 _SPAWN = get_context("spawn")
 
 
-def test_without_pictures_it_says_how_to_make_them(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match="make_detection_dataset"):
+def test_missing_pictures_are_reported_with_the_command_that_makes_them(tmp_path: Path) -> None:
+    with raises(MissingFileError, "no_data") as caught:
         main(Config(data=tmp_path))
+    assert "make_detection_dataset" in str(caught.value)
 
 
 def _learn(end: Connection) -> None:
@@ -31,14 +34,14 @@ def _start(end: Connection) -> None:
     child.join()
 
 
-def test_its_processes_end_when_the_one_that_started_them_is_killed() -> None:
+def test_its_processes_end_when_their_parent_is_killed() -> None:
     here, there = _SPAWN.Pipe(duplex=False)
     parent = _SPAWN.Process(target=_start, args=(there,))
     parent.start()
     there.close()
     assert here.recv() == "up"
     parent.kill()
-    assert here.poll(60.0), "the child still holds its end of the pipe"
+    assert here.poll(60.0), "the child's end of the pipe is still open"
     with pytest.raises(EOFError):
         here.recv()
     parent.join()

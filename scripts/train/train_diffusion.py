@@ -1,14 +1,14 @@
-"""Trains the grasp generator and its discriminator on the CPU and writes their weights.
+"""Train the grasp generator and its discriminator on the CPU and write their weights.
 
     python -m scripts.train.make_grasp_dataset
-    nice -n 19 python -m scripts.train.train_graspgen            # goes on where it stopped; an hour on one core
-    python -m scripts.train.evaluate_graspgen                    # writes models/weights/graspgen_agnostic.json
-    python -m scripts.train.train_graspgen --run out/graspgen/more --start-from models/weights/graspgen_agnostic.npz
+    nice -n 19 python -m scripts.train.train_diffusion            # resumes; an hour on one core
+    python -m scripts.train.evaluate_diffusion                    # writes models/weights/diffusion.json
+    python -m scripts.train.train_diffusion --run out/diffusion/more --start-from models/weights/diffusion.npz
 
     python -m scripts.train.make_grasp_dataset --gripper z1 --shards 24
-    python -m scripts.train.train_graspgen --gripper z1 --start-from models/weights/graspgen_agnostic.npz
+    python -m scripts.train.train_diffusion --gripper z1 --start-from models/weights/diffusion.npz
 
-Checkpoints lie in the run's folder. With the same data, seed, torch version and machine the weights come out the same.
+Checkpoints are in the run's folder. With the same data, seed, torch version and machine the weights come out the same.
 """
 
 from __future__ import annotations
@@ -23,8 +23,9 @@ import tyro
 from rich.console import Console
 
 from models.diffusion.training.data import GraspData, load_shards
-from models.diffusion.training.labelled_samples import judge_samples
-from models.diffusion.training.labels import GRIPPERS
+from models.diffusion.training.grippers import GRIPPERS
+from models.diffusion.training.labelled_samples import ProgressCallback, label_samples
+from models.diffusion.training.shards import make_shard, save_shard
 from models.diffusion.training.training import (
     TrainingConfig,
     calibrate_discriminator,
@@ -32,36 +33,35 @@ from models.diffusion.training.training import (
     train_generator,
 )
 from models.diffusion.weights import load_weights, save_weights, weights_path
-from scripts.train.make_grasp_dataset import make_shard, save_shard
 
 _REPORT_EVERY = 200
 
 
 @dataclass(frozen=True, kw_only=True)
 class Config:
-    """What to train, and on what."""
+    """Data, folders and settings of the training."""
 
     gripper: str = "agnostic"
-    """Which hand of `models.diffusion.training.labels.GRIPPERS`."""
-    data: Path = Path("out/graspgen")
+    """Gripper of `models.diffusion.training.grippers.GRIPPERS`."""
+    data: Path = Path("out/diffusion")
     """Folder that `make_grasp_dataset` wrote."""
-    run: Path = Path("out/graspgen")
-    """Folder for checkpoints; give another one to start anew."""
+    run: Path = Path("out/diffusion")
+    """Folder for checkpoints; another one starts a new run."""
     threads: int = 1
     """Processor threads."""
     weights: Path | None = None
-    """Where the weights go; beside the shipped ones if not given."""
+    """File of the weights; by default the shipped one of the gripper."""
     start_from: Path | None = None
-    """Weights whose generator is trained on, or that of another hand is tuned for this one."""
-    held_back: int = 80
-    """Shapes that calibrate the discriminator and that nothing was trained on."""
-    held_back_seed: int = 500_000
-    """Seed of those."""
+    """Weights to continue from, of this gripper or of another one."""
+    calibration_shapes: int = 80
+    """Shapes outside of the training data that calibrate the discriminator."""
+    calibration_seed: int = 500_000
+    """Seed of those, used by neither training nor evaluation."""
     training: TrainingConfig = field(default_factory=TrainingConfig)
 
 
 def main(config: Config) -> None:
-    """Train what is not trained yet."""
+    """Train the stages that are not complete, and write weights and recipe."""
     torch.set_num_threads(config.threads)
     console = Console()
     gripper = GRIPPERS[config.gripper]
@@ -69,104 +69,107 @@ def main(config: Config) -> None:
     console.print(f"{len(data.family)} shapes, {len(data.clouds)} views")
     stem = config.run / config.gripper
     stem.mkdir(parents=True, exist_ok=True)
-    reporter = _Reporter(console, stem.with_suffix(".curves.json"))
+    reporter = _CurveRecorder(console, stem.with_suffix(".curves.json"))
     generator = train_generator(
         data,
         config.training,
         stem.with_suffix(".generator.pt"),
-        reporter.named("generator"),
+        reporter.report("generator"),
         symmetric=gripper.symmetric,
         start_from=load_weights(config.start_from)[0] if config.start_from else None,
     )
-    judging, seed = config.training.judging, config.training.seed
-    judged = judge_samples(
+    labelling, seed = config.training.labelling, config.training.seed
+    labelled = label_samples(
         generator,
         data,
         gripper,
-        config=judging,
+        config=labelling,
         seed=seed,
-        folder=stem / "judged",
-        progress=reporter.named("judged, share valid"),
+        folder=stem / "labelled",
+        progress=reporter.report("labelled samples, valid ratio"),
     )
     discriminator = train_discriminator(
         generator,
         data,
-        judged,
+        labelled,
         config=config.training,
         checkpoint=stem.with_suffix(".discriminator.pt"),
-        progress=reporter.named("discriminator"),
+        progress=reporter.report("discriminator"),
         symmetric=gripper.symmetric,
     )
-    fresh = _held_back(config)
+    calibration = _load_calibration_data(config)
     scale, offset = calibrate_discriminator(
         discriminator,
-        fresh,
-        judge_samples(
+        calibration,
+        label_samples(
             generator,
-            fresh,
+            calibration,
             gripper,
-            config=replace(judging, views=len(fresh.clouds), perturbed=0, shaken_share=0.0),
+            config=replace(labelling, views=len(calibration.clouds), perturbed=0, simulated_fraction=0.0),
             seed=seed,
-            folder=stem / "held_back" / "judged",
-            progress=reporter.named("held back, share valid"),
+            folder=stem / "calibration" / "labelled",
+            progress=reporter.report("calibration, valid ratio"),
         ),
     )
     path = config.weights or weights_path(config.gripper)
     path.parent.mkdir(parents=True, exist_ok=True)
     digest = save_weights(path, generator, discriminator)
     recipe = {"shapes": len(data.family), "views": len(data.clouds), "training": asdict(config.training)}
-    recipe |= {"start_from": _origin(config.start_from), "gripper": asdict(gripper)}
+    recipe |= {"start_from": _describe_origin(config.start_from), "gripper": asdict(gripper)}
     recipe |= {
-        "labels_shaken": _count_shaken(config.data / config.gripper),
-        "samples_shaken": {"tried": judged.shaken, "lost": judged.lost},
+        "labels_simulated": _count_simulated(config.data / config.gripper),
+        "samples_simulated": {"tried": labelled.simulated, "lost": labelled.lost},
     }
-    recipe |= {"calibration": {"shapes": config.held_back, "scale": round(scale, 4), "offset": round(offset, 4)}}
+    recipe |= {
+        "calibration": {"shapes": config.calibration_shapes, "scale": round(scale, 4), "offset": round(offset, 4)}
+    }
     recipe |= {"torch": torch.__version__, "losses": reporter.curves}
     path.with_suffix(".recipe.json").write_text(json.dumps(recipe, indent=1) + "\n")
     console.print(f"wrote {path} ({path.stat().st_size / 1e6:.1f} MB, SHA-256 {digest[:12]}…)")
 
 
-def _held_back(config: Config) -> GraspData:
+def _load_calibration_data(config: Config) -> GraspData:
     """Return shapes and views of seeds that neither training nor evaluation use."""
-    folder = config.data / config.gripper / "held_back"
+    folder = config.data / config.gripper / "calibration"
     folder.mkdir(exist_ok=True)
-    path = folder / f"{config.held_back_seed}-{config.held_back}.npz"
+    seed, count = config.calibration_seed, config.calibration_shapes
+    path = folder / f"{seed}-{count}.npz"
     if not path.exists():
-        save_shard(path, make_shard(GRIPPERS[config.gripper], config.held_back_seed, config.held_back, n_views=2))
+        save_shard(path, make_shard(GRIPPERS[config.gripper], seed, count, n_views=2))
     return load_shards(folder)
 
 
-def _origin(weights: Path | None) -> dict | None:
-    """Return what the recipe says of weights that were started from: their name and, if it is there, their recipe."""
+def _describe_origin(weights: Path | None) -> dict | None:
+    """Return the recipe's entry for the weights to continue from: their name and, if it exists, their recipe."""
     if weights is None:
         return None
     path = weights.with_suffix(".recipe.json")
     return {"name": weights.name, "recipe": json.loads(path.read_text()) if path.exists() else None}
 
 
-def _count_shaken(folder: Path) -> dict[str, dict[str, int]]:
-    """Return how many ground-truth labels were tried in dynamics and how many were lost, by family."""
+def _count_simulated(folder: Path) -> dict[str, dict[str, int]]:
+    """Return the numbers of simulated and of lost ground-truth labels, by family."""
     totals: dict[str, Counter[str]] = {"tried": Counter(), "lost": Counter()}
     for path in folder.glob("*.shaken.json"):
-        verdicts = json.loads(path.read_text())
+        outcome = json.loads(path.read_text())
         for key, total in totals.items():
-            total.update(verdicts[key])
+            total.update(outcome[key])
     return {key: dict(sorted(total.items())) for key, total in totals.items()}
 
 
-class _Reporter:
-    """Prints a running mean now and then, and keeps it for the recipe, over interruptions too."""
+class _CurveRecorder:
+    """Recorder of running means for console and recipe, kept over interruptions."""
 
     def __init__(self, console: Console, path: Path) -> None:
         self.curves: dict[str, list[tuple[int, float]]] = json.loads(path.read_text()) if path.exists() else {}
         self._console = console
         self._path = path
 
-    def named(self, name: str):
-        """Return a progress function for one stage."""
+    def report(self, name: str) -> ProgressCallback:
+        """Return the progress callback of one stage."""
         recent: list[float] = []
 
-        def report(iteration: int, value: float) -> None:
+        def record(iteration: int, value: float) -> None:
             recent.append(value)
             if iteration % _REPORT_EVERY == 0:
                 before = [(i, v) for i, v in self.curves.get(name, []) if i < iteration]
@@ -175,7 +178,7 @@ class _Reporter:
                 self._console.print(name, *self.curves[name][-1])
                 recent.clear()
 
-        return report
+        return record
 
 
 if __name__ == "__main__":

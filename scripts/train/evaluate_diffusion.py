@@ -1,10 +1,10 @@
-"""Measures the grasp generator on shapes it never saw and writes `models/weights/graspgen_<gripper>.json`.
+"""Evaluate the grasp generator on shapes outside of its training data; writes `models/weights/diffusion*.json`.
 
-    nice -n 19 python -m scripts.train.evaluate_graspgen                  # a few minutes on one core
-    python -m scripts.train.evaluate_graspgen --generator antipodal       # the sampler without learning, to compare
+    nice -n 19 python -m scripts.train.evaluate_diffusion                  # a few minutes on one core
+    python -m scripts.train.evaluate_diffusion --generator antipodal       # the sampler without learning, to compare
 
-Every grasp is checked against the true solid: the open hand touches nothing, both pads touch within the friction cone.
-`raw` is the generator's own share, `returned` and all other shares are of what `sample` gives out of `drawn` as many.
+Every grasp is checked against the solid: the open gripper touches nothing, both pads touch within the friction cone.
+`raw` is the valid ratio of the generator alone; `returned` and all other ratios are of the grasps of `sample`.
 """
 
 from __future__ import annotations
@@ -22,48 +22,49 @@ from rich.progress import track
 
 from hal.base.clock import Stopwatch
 from models.diffusion.sampler import DiffusionConfig, DiffusionSampler
-from models.diffusion.training.labels import GRIPPERS, Hand, find_grasps
-from models.diffusion.training.shapes import KNOWN_FAMILIES, UNSEEN_FAMILIES, make_shape
+from models.diffusion.training.grippers import GRIPPERS, AnyGripper
+from models.diffusion.training.labels import find_grasps
+from models.diffusion.training.metrics import measure_cloud, summarise
+from models.diffusion.training.shapes import HELD_OUT_FAMILIES, KNOWN_FAMILIES, make_shape
 from models.diffusion.training.solids import Solid
 from models.diffusion.training.views import ViewConfig, render_view
 from models.diffusion.weights import weights_path
 from models.samplers.antipodal import AntipodalConfig, AntipodalSampler
 from models.types import GraspGenerator
-from scripts.train.grasp_measures import measure_cloud, summarise
 
 CONDITIONS = {
-    "as trained": ViewConfig(occluded_share=0.0),
-    "frontal, 5° elevation": ViewConfig(frontal_share=1.0, frontal_elevation_deg=(5.0, 5.0), occluded_share=0.0),
-    "35 % occluded": ViewConfig(occluded_share=1.0, hidden=(0.35, 0.35)),
+    "as trained": ViewConfig(occluded_view_ratio=0.0),
+    "frontal, 5° elevation": ViewConfig(frontal_ratio=1.0, frontal_elevation_deg=(5.0, 5.0), occluded_view_ratio=0.0),
+    "35 % occluded": ViewConfig(occluded_view_ratio=1.0, occluded_point_ratio=(0.35, 0.35)),
 }
-"""How the shapes are seen."""
+"""Conditions of the views."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Config:
-    """What to measure, and how much."""
+    """Extent of the evaluation."""
 
     generator: Literal["diffusion", "antipodal"] = "diffusion"
-    """Which generator."""
+    """Evaluated generator."""
     gripper: str = "agnostic"
-    """Which hand."""
+    """Gripper of the weights."""
     shapes: int = 60
     """Shapes in each set; 0 measures the time alone and writes nothing."""
     samples: int = 800
     """Grasps of each view."""
-    shakes: int = 4
-    """Grasps of each verdict on a view that are tried in dynamics, as trained."""
+    simulations: int = 4
+    """Grasps of each label on a view that are simulated, under the training's conditions."""
     latency_threads: int = 2
-    """Parts side by side when the time is measured."""
+    """Parallel parts when the latency is measured."""
     seed: int = 900_000
     """Seed of the first shape; far from those of the training data."""
     out: Path | None = None
-    """Where the figures go; beside the weights if not given."""
+    """File of the figures; next to the weights by default."""
     diffusion: DiffusionConfig = field(default_factory=DiffusionConfig)
 
 
 def main(config: Config) -> None:
-    """Measure both sets under all conditions, print a table and write the figures."""
+    """Evaluate both sets under all conditions, print and write the figures."""
     gripper = GRIPPERS[config.gripper]
     generator: GraspGenerator
     if config.generator == "diffusion":
@@ -75,11 +76,11 @@ def main(config: Config) -> None:
     report["latency_threads"] = config.latency_threads
     if config.generator == "diffusion":
         report["sampling"] = {
-            k: v for k, v in asdict(config.diffusion).items() if k in ("steps", "temperature", "drawn")
+            k: v for k, v in asdict(config.diffusion).items() if k in ("steps", "temperature", "oversampling")
         }
         weights = config.diffusion.weights or weights_path(config.gripper)
         report["weights_sha256"] = weights.with_suffix(".sha256").read_text().split()[0]
-    sets = (("known families", KNOWN_FAMILIES), ("unseen families", UNSEEN_FAMILIES)) if config.shapes else ()
+    sets = (("known families", KNOWN_FAMILIES), ("held-out families", HELD_OUT_FAMILIES)) if config.shapes else ()
     for name, families in sets:
         for condition, view in CONDITIONS.items():
             clouds = [
@@ -90,7 +91,7 @@ def main(config: Config) -> None:
                     points,
                     T_camera_object=T,
                     samples=config.samples,
-                    shakes=config.shakes if view is CONDITIONS["as trained"] else 0,
+                    simulations=config.simulations if view is CONDITIONS["as trained"] else 0,
                 )
                 for solid, points, T in track(
                     list(draw_clouds(list(families), view, config.shapes, config.seed, gripper)),
@@ -111,21 +112,21 @@ def main(config: Config) -> None:
 
 
 def draw_clouds(
-    families: list[str], view: ViewConfig, count: int, seed: int, gripper: Hand = GRIPPERS["agnostic"]
+    families: list[str], view: ViewConfig, count: int, seed: int, gripper: AnyGripper = GRIPPERS["agnostic"]
 ) -> Iterator[tuple[Solid, np.ndarray, np.ndarray]]:
     """Yield `count` solids, families in turn, each with its visible points and T_camera_object."""
     for index in range(count):
         rng = np.random.default_rng(seed + index)
-        seen = None
-        while seen is None:
+        rendered = None
+        while rendered is None:
             solid = make_shape(families[index % len(families)], rng)
             if len(find_grasps(solid, gripper, rng, 400)[0]) >= 20:
-                seen = render_view(solid, view, rng)
-        yield solid, *seen
+                rendered = render_view(solid, view, rng)
+        yield solid, *rendered
 
 
 def measure_latency(generator: GraspGenerator, samples: int) -> dict:
-    """Return the time for scored samples from 2,000 points [s]."""
+    """Return the latency of scored samples from 2,000 points [s]."""
     angle, height = np.random.default_rng(0).uniform(size=(2, 2000))
     points = np.stack([0.03 * np.cos(np.pi * angle), 0.15 * height, 0.4 - 0.03 * np.sin(np.pi * angle)], axis=1)
     times = []

@@ -1,6 +1,6 @@
-"""Messages between a generator's own process and ours: arrays by name, as NumPy's .npz with its length before it.
+"""Messages between this process and a generator's own: arrays by name, as NumPy's .npz with its length in front.
 
-Needs Python and NumPy alone, of any versions: the other side has packages of its own.
+Only Python and NumPy are required, of any versions: the other process has packages of its own.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ import numpy as np
 
 from hal.base.errors import Z1Error
 
-PROTOCOL = 1
-"""Both sides must say the same."""
+PROTOCOL = 2
+"""Version of the messages; both sides must have the same."""
 _LENGTH = struct.Struct("<Q")
-_MAX_BYTES = 256 << 20
+_MAX_BYTES = 256 << 20  # far above any grasp set; printed text, read as a length, is far above it
 
 
 class PipeError(Z1Error, RuntimeError):
-    """What came is no message: cut off, too long, or not arrays."""
+    """Invalid message: cut off, too long, or without arrays."""
 
     default_code = "pipe"
 
@@ -38,21 +38,24 @@ def read_message(stream: BinaryIO) -> dict[str, np.ndarray] | None:
     """Return the next message of `stream`, or None where it has ended.
 
     Raises:
-        PipeError: it ends within a message, or what comes is none.
+        PipeError: the stream ends within a message, or a message is invalid.
     """
     head = stream.read(_LENGTH.size)
     if not head:
         return None
     if len(head) < _LENGTH.size:
-        raise PipeError("the stream ended within a message.")
+        raise PipeError("the stream ended within a message.", code="message_cut")
     (length,) = _LENGTH.unpack(head)
     if length > _MAX_BYTES:
-        raise PipeError(f"a message of {length} bytes is announced; allowed are {_MAX_BYTES}. Was something printed?")
+        raise PipeError(
+            f"a message of {length} bytes is announced; allowed are {_MAX_BYTES}. Check the process for prints.",
+            code="message_length",
+        )
     body = stream.read(length)
     if len(body) < length:
-        raise PipeError("the stream ended within a message.")
+        raise PipeError("the stream ended within a message.", code="message_cut")
     try:
         with np.load(io.BytesIO(body), allow_pickle=False) as file:
             return {name: file[name] for name in file.files}
     except Exception as err:  # NumPy and zipfile raise a dozen kinds for bytes that are no .npz
-        raise PipeError(f"a message holds no plain arrays ({err}).") from err
+        raise PipeError(f"a message holds no plain arrays ({err}).", code="message_not_arrays") from err
