@@ -82,7 +82,7 @@ def test_intrinsics_are_found_from_the_same_samples(calibrations: Path, tmp_path
     arguments = [f"--samples={calibrations / 'samples'}", f"--calibrations={tmp_path}"]
     assert cli.main(["calibrate", "intrinsics", *arguments]) == 0
     found = load_newest(tmp_path, "intrinsics", MOUNT.camera_serial())
-    stated = load_samples(calibrations / "samples").session.camera
+    stated = load_samples(calibrations / "samples").info.camera
     assert np.abs(found.camera.matrix - stated.matrix).max() < 4.0  # ten views: no more than 1 %
     assert "<svg" in next(tmp_path.glob("intrinsics_*.html")).read_text()
 

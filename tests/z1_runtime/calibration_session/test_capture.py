@@ -19,8 +19,8 @@ from hal.base.transforms import pose_error
 from scripts.support.calibration_robot import CalibrationRobot, RobotOptions, open_robot
 from scripts.support.demo_robot import lockstep_robot
 from sim_twin.model.scene import SceneConfig
-from z1_runtime.calibration_session.board_search import BoardSearch, still_frame
-from z1_runtime.calibration_session.capture import Capture, Key
+from z1_runtime.calibration_session.board_search import BoardSearch, capture_still_frame
+from z1_runtime.calibration_session.capture import Key, SampleCapture
 from z1_runtime.geometry.kinematics import Kinematics
 from z1_runtime.motion.executor import Executor, MotionError
 from z1_runtime.motion.trajectory import MotionLimits, joint_move
@@ -35,8 +35,8 @@ def robot() -> Iterator[CalibrationRobot]:
         yield robot
 
 
-def capture_into(folder: Path, robot: CalibrationRobot, board: Board = BOARD) -> Capture:
-    return Capture(arm=robot.arm, camera=robot.camera, clock=robot.clock, board=board, folder=folder)
+def capture_into(folder: Path, robot: CalibrationRobot, board: Board = BOARD) -> SampleCapture:
+    return SampleCapture(arm=robot.arm, camera=robot.camera, clock=robot.clock, board=board, folder=folder)
 
 
 def search_with(robot: CalibrationRobot) -> BoardSearch:
@@ -49,14 +49,14 @@ def folder(robot: CalibrationRobot, tmp_path_factory: pytest.TempPathFactory) ->
     folder = tmp_path_factory.mktemp("samples")
     first = capture_into(folder, robot)
     assert first.open("2026-01-01T00:00:00+00:00") == 0
-    pictures = first.drive(search_with(robot), wanted=3)
+    pictures = first.capture_automatically(search_with(robot), wanted=3)
     name = next(pictures).name
     pictures.close()  # as Ctrl-C does
     assert [path.stem for path in folder.glob("0*.json")] == [name]
 
     second = capture_into(folder, robot)
     assert second.open("2026-01-01T00:01:00+00:00") == 1
-    assert sum(bool(taken.name) for taken in second.drive(search_with(robot), wanted=3)) == 2
+    assert sum(bool(taken.name) for taken in second.capture_automatically(search_with(robot), wanted=3)) == 2
     assert len(second.taken) == 3
     return folder
 
@@ -64,8 +64,8 @@ def folder(robot: CalibrationRobot, tmp_path_factory: pytest.TempPathFactory) ->
 def test_an_interrupted_capture_goes_on_where_it_stopped(folder: Path):
     loaded = load_samples(folder)
     assert len(loaded.samples) == 3 and not loaded.warnings
-    assert loaded.session.date == "2026-01-01T00:00:00+00:00"
-    assert loaded.session.serial.startswith("twin-4mm")
+    assert loaded.info.date == "2026-01-01T00:00:00+00:00"
+    assert loaded.info.serial.startswith("twin-4mm")
 
 
 def test_each_sample_tells_where_the_arm_stood(folder: Path):
@@ -120,7 +120,7 @@ def test_a_guided_arm_is_sampled_when_it_holds_a_new_view_still(robot: Calibrati
     move(robot, views[0])
     past_the_board = np.append(z1.Q_HOME, 0.0)
     past_the_board[0] = 1.2
-    taken = list(capture.follow_hand(Hand(robot, [past_the_board, views[1]], {}), wanted=2))
+    taken = list(capture.capture_hand_guided(Hand(robot, [past_the_board, views[1]], {}), wanted=2))
     assert [one.name for one in taken] == ["0001", "", "0002"]  # what shows nothing is tried once
     for q, sample in zip(views, load_samples(tmp_path).samples, strict=True):
         assert np.abs(sample.q - q).max() < 5e-3
@@ -131,7 +131,7 @@ def test_an_operator_takes_and_ends_by_hand_and_nothing_moves_the_arm(robot: Cal
     capture.open("2026-01-01T00:00:00+00:00")
     hand = Hand(robot, [], {3: "take", 7: "take", 9: "end"})
     before = robot.arm.status().trajectory_id
-    taken = list(capture.follow_hand(hand, wanted=20, by_itself=False))
+    taken = list(capture.capture_hand_guided(hand, wanted=20, by_itself=False))
     assert [one.name for one in taken] == ["0001", "0002"]
     assert robot.arm.status().trajectory_id == before
 
@@ -141,10 +141,10 @@ def test_a_table_without_the_board_is_told(tmp_path: Path):
         robot = undo.enter_context(lockstep_robot(SceneConfig(object="box")))
         robot.arm.claim("test")
         devices = {"arm": robot.arm, "camera": robot.camera, "clock": robot.clock, "board": BOARD}
-        capture = Capture(**devices, folder=tmp_path)
+        capture = SampleCapture(**devices, folder=tmp_path)
         capture.open("2026-01-01T00:00:00+00:00")
         with pytest.raises(CalibrationError) as error:
-            next(capture.drive(BoardSearch(**devices, speed=1.0), wanted=3))
+            next(capture.capture_automatically(BoardSearch(**devices, speed=1.0), wanted=3))
         assert error.value.code == "no_board"
         assert not load_samples(tmp_path).samples
 
@@ -174,10 +174,10 @@ class StillCamera:
 
 def test_a_picture_taken_while_the_arm_moves_is_taken_again(robot: CalibrationRobot):
     camera = StillCamera(robot.camera.wait_for_frame(1.0))
-    _, q = still_frame(ShakyArm(3), camera, 1.0)  # pyright: ignore[reportArgumentType] (what is used of them)
+    _, q = capture_still_frame(ShakyArm(3), camera, 1.0)  # pyright: ignore[reportArgumentType] (what is used of them)
     assert q[3] == pytest.approx(z1.Q_HOME[3] + 0.03)
     with pytest.raises(MotionError, match=r"joint4 moves by 0\.0100 rad.*allowed is 0\.001 rad"):
-        still_frame(ShakyArm(100), camera, 1.0)  # pyright: ignore[reportArgumentType]
+        capture_still_frame(ShakyArm(100), camera, 1.0)  # pyright: ignore[reportArgumentType]
 
 
 def test_the_coverage_grows_with_every_sample(robot: CalibrationRobot, folder: Path):

@@ -16,9 +16,9 @@ from z1_runtime.calibration_session.viewpoints import (
     Viewpoint,
     ViewpointConfig,
     find_viewpoints,
-    look_around,
-    plan_way,
-    table_only,
+    make_table_checker,
+    plan_free_motion,
+    scan_scene,
 )
 from z1_runtime.collision.scene_collision import CollisionChecker
 from z1_runtime.geometry.kinematics import Kinematics
@@ -62,7 +62,7 @@ def lying(x_m: float, y_m: float) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def checker(kinematics: Kinematics) -> CollisionChecker:
-    return look_around(kinematics, frame_from_home(kinematics), HOME)
+    return scan_scene(kinematics, frame_from_home(kinematics), HOME)
 
 
 def views_of(kinematics: Kinematics, checker: CollisionChecker, T_base_board: np.ndarray, **options) -> list[Viewpoint]:
@@ -80,7 +80,7 @@ def test_each_view_puts_the_camera_where_it_says_and_sees_the_board(kinematics, 
         points = (points - reached[:3, 3]) @ reached[:3, :3]
         u, v = (INTRINSICS.K @ (points / points[:, 2:]).T)[:2]
         inside = (u > 0) & (u < INTRINSICS.width) & (v > 0) & (v < INTRINSICS.height)
-        assert inside.mean() >= view.seen >= CONFIG.min_seen
+        assert inside.mean() >= view.seen >= CONFIG.min_visible_ratio
         tilt_deg = np.rad2deg(np.arccos(reached[:3, 2] @ T_base_board[:3, 2]))
         assert tilt_deg <= CONFIG.max_tilt_deg + 1e-6
         assert checker.check_posture(view.q) is None
@@ -117,19 +117,19 @@ def test_a_board_out_of_reach_is_told_with_the_reasons_counted(kinematics, check
 
 def test_what_stands_on_the_table_is_kept_away_from(kinematics, checker):
     box = (np.array([0.50, -0.20, 0.0]), np.array([0.60, 0.20, 0.30]))
-    walled = look_around(kinematics, frame_from_home(kinematics, box), HOME)
+    walled = scan_scene(kinematics, frame_from_home(kinematics, box), HOME)
     assert len(walled.scene_index) > 100 and len(checker.scene_index) == 0
     T_pivot = np.eye(4)
     T_pivot[:3, 3] = [0.50, 0.0, 0.25]  # the tips reach 0.1 m beyond: into the box
     q = np.append(kinematics.best(T_pivot).q, 0.0)
     limits = MotionLimits()
-    assert plan_way(checker, HOME, q, limits) is not None
-    assert plan_way(walled, HOME, q, limits) is None
+    assert plan_free_motion(checker, HOME, q, limits) is not None
+    assert plan_free_motion(walled, HOME, q, limits) is None
 
 
 def test_a_free_way_ends_at_rest_where_it_was_asked_to(kinematics, checker):
     view = views_of(kinematics, checker, lying(0.495, 0.10))[-1]
-    way = plan_way(checker, HOME, view.q, MotionLimits())
+    way = plan_free_motion(checker, HOME, view.q, MotionLimits())
     assert way is not None
     assert np.allclose(way.q[0], HOME) and np.allclose(way.q[-1], view.q) and not way.dq[-1].any()
 
@@ -139,8 +139,11 @@ def test_the_way_home_may_begin_closer_to_the_table_than_views_may_be(kinematics
     T_pivot[:3, :3] = [[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]]  # pointing down
     T_pivot[:3, 3] = [0.40, 0.0, 0.110]  # tips 10 mm over the table
     low = np.append(kinematics.best(T_pivot).q, 0.0)
-    assert plan_way(checker, low, HOME, MotionLimits()) is None
-    assert plan_way(table_only(kinematics, frame_from_home(kinematics), low), low, HOME, MotionLimits()) is not None
+    assert plan_free_motion(checker, low, HOME, MotionLimits()) is None
+    assert (
+        plan_free_motion(make_table_checker(kinematics, frame_from_home(kinematics), low), low, HOME, MotionLimits())
+        is not None
+    )
 
 
 @pytest.mark.parametrize("wrong", [{"n": 0}, {"distance_m": (0.3, 0.2)}, {"max_tilt_deg": 90.0}, {"n": 5000}])
