@@ -27,7 +27,7 @@ def test_own_method_agrees_with_opencvs_park() -> None:
     data = make_problem(3, arm_m=2e-4, arm_rad=3e-4)
     own = solve_park_martin(data.Ts_anchor_mount, data.Ts_camera_board)
     opencvs = dict(solve_closed_forms(data.Ts_anchor_mount, data.Ts_camera_board))["park"]
-    np.testing.assert_allclose(own, opencvs, atol=1e-6)
+    np.testing.assert_allclose(own, opencvs, atol=2e-5)
 
 
 @pytest.mark.parametrize("n_outliers", [0, 3, 5])

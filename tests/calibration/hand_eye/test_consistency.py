@@ -81,8 +81,8 @@ def test_fixed_board_has_no_move_even_with_an_outlier() -> None:
 
 
 MISTAKES: dict[str, Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]] = {
-    "arm's poses are inverted": lambda A, B: (inverse(A), B),
-    "board's poses are inverted": lambda A, B: (A, inverse(B)),
+    "arm's": lambda A, B: (inverse(A), B),
+    "board's": lambda A, B: (A, inverse(B)),
     "reversed": lambda A, B: (A[::-1], B),
     "next pose": lambda A, B: (A[:-1], B[1:]),
     "previous pose": lambda A, B: (A[1:], B[:-1]),
@@ -94,7 +94,8 @@ def test_mistakes_in_the_order_are_diagnosed(mistake: str) -> None:
     data = noisy_problem(5, 12)
     diagnosis = diagnose_pose_order(*MISTAKES[mistake](data.Ts_anchor_mount, data.Ts_camera_board))
     assert diagnosis is not None
-    assert mistake in diagnosis
+    # Inverted arm poses are explained by inverted board poses as well, and the reverse
+    assert ("poses are inverted" if mistake in ("arm's", "board's") else mistake) in diagnosis
 
 
 def test_correct_and_unrelated_poses_have_no_diagnosis() -> None:
