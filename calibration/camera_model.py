@@ -12,10 +12,10 @@ from calibration.errors import CalibrationError
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class CameraModel:
-    """What turns a point in front of the camera into a pixel; the centre of pixel (0, 0) is at 0.0.
+    """Projection of points in front of a camera to pixels; the centre of pixel (0, 0) is at 0.0.
 
     Raises:
-        CalibrationError: `bad_camera`: wrong shapes, values that are not finite, no focal length.
+        CalibrationError: `bad_camera`: wrong shapes, values that are not finite, or no focal length.
     """
 
     matrix: np.ndarray
@@ -29,12 +29,17 @@ class CameraModel:
         for name, shape in (("matrix", (3, 3)), ("distortion", (5,))):
             array = np.array(getattr(self, name), dtype=np.float64)
             if array.shape != shape or not np.isfinite(array).all():
-                raise CalibrationError("bad_camera", f"a camera's {name} is {shape} and finite; got\n{array}")
+                raise CalibrationError(
+                    f"camera {name}: the value is not a finite array of shape {shape}:\n{array}", code="bad_camera"
+                )
             array.setflags(write=False)
             object.__setattr__(self, name, array)
         width, height = self.size
         if min(width, height, self.matrix[0, 0], self.matrix[1, 1]) <= 0:
-            raise CalibrationError("bad_camera", f"no camera has the matrix\n{self.matrix}\nand the size {self.size}.")
+            raise CalibrationError(
+                f"camera: focal lengths and size must be positive (matrix\n{self.matrix}\nsize {self.size}).",
+                code="bad_camera",
+            )
         object.__setattr__(self, "size", (int(width), int(height)))
 
     @classmethod
@@ -45,33 +50,34 @@ class CameraModel:
 
     def project(self, points_m: np.ndarray) -> np.ndarray:
         """Return the pixels (..., 2) of points (..., 3) in the camera frame [m], z > 0."""
-        return self.project_with_slope(points_m)[0]
+        return self.project_with_jacobian(points_m)[0]
 
-    def project_with_slope(self, points_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the pixels (..., 2) of points (..., 3), and their derivatives (..., 2, 3) [px/m]."""
+    def project_with_jacobian(self, points_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the pixels (..., 2) of points (..., 3), and their Jacobian (..., 2, 3) by the point [px/m]."""
         k1, k2, p1, p2, k3 = self.distortion
         inverse_z = 1.0 / points_m[..., 2]
         x, y = points_m[..., 0] * inverse_z, points_m[..., 1] * inverse_z
         r2 = x * x + y * y
+        # Brown-Conrady model as in OpenCV's calib3d: radial terms k, tangential terms p
         radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        slope = 2.0 * (k1 + r2 * (2.0 * k2 + 3.0 * r2 * k3))  # of radial, by x over x
-        bent = np.stack(
+        d_radial = 2.0 * (k1 + r2 * (2.0 * k2 + 3.0 * r2 * k3))  # d radial / dx = x · d_radial
+        distorted = np.stack(
             [
                 x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
                 y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
             ],
             axis=-1,
         )
-        cross = x * y * slope + 2.0 * (p1 * x + p2 * y)
-        d_bent = np.empty((*x.shape, 2, 2))
-        d_bent[..., 0, 0] = radial + x * x * slope + 2.0 * p1 * y + 6.0 * p2 * x
-        d_bent[..., 0, 1] = d_bent[..., 1, 0] = cross
-        d_bent[..., 1, 1] = radial + y * y * slope + 6.0 * p1 * y + 2.0 * p2 * x
+        cross = x * y * d_radial + 2.0 * (p1 * x + p2 * y)
+        d_distorted = np.empty((*x.shape, 2, 2))
+        d_distorted[..., 0, 0] = radial + x * x * d_radial + 2.0 * p1 * y + 6.0 * p2 * x
+        d_distorted[..., 0, 1] = d_distorted[..., 1, 0] = cross
+        d_distorted[..., 1, 1] = radial + y * y * d_radial + 6.0 * p1 * y + 2.0 * p2 * x
         d_ray = np.zeros((*x.shape, 2, 3))
         d_ray[..., 0, 0] = d_ray[..., 1, 1] = inverse_z
         d_ray[..., 0, 2], d_ray[..., 1, 2] = -x * inverse_z, -y * inverse_z
         focal = self.matrix[:2, :2]
-        return bent @ focal.T + self.matrix[:2, 2], focal @ d_bent @ d_ray
+        return distorted @ focal.T + self.matrix[:2, 2], focal @ d_distorted @ d_ray
 
     def to_dict(self) -> dict[str, Any]:
         """Return the fields for a JSON file."""
@@ -87,7 +93,9 @@ class CameraModel:
         try:
             width, height = values["size"]
             return cls(matrix=values["matrix"], distortion=values["distortion"], size=(width, height))
+        except CalibrationError:
+            raise
         except (KeyError, TypeError, ValueError) as error:
-            if isinstance(error, CalibrationError):
-                raise
-            raise CalibrationError("bad_camera", f"{values} is no camera: {error!r}.") from error
+            raise CalibrationError(
+                f"camera: the fields cannot be used ({values}): {error!r}.", code="bad_camera"
+            ) from error

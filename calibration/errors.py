@@ -1,4 +1,4 @@
-"""What a calibration says when it cannot go on, and when it can but somebody should look."""
+"""Errors and warnings of the calibration."""
 
 from __future__ import annotations
 
@@ -8,22 +8,21 @@ from hal.base.errors import Z1Error
 
 
 class CalibrationError(Z1Error, ValueError):
-    """A calibration that cannot be done, read or used; `code` is for programs, the message for the operator."""
+    """A calibration that cannot be done, read or used."""
 
-    def __init__(self, code: str, message: str) -> None:
-        super().__init__(message, code=code)
+    default_code = "calibration"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CalibrationWarning:
-    """Something an operator can act on; the calibration went on without it."""
+    """A finding that an operator can act on; the calibration continued."""
 
     code: str
     """Short, stable name: `too_few_poses`, `too_similar_poses`, `wrong_square_size`, `board_moved`, …"""
     message: str
-    """What was seen, what is expected, what to do next."""
+    """What was found, what is expected, what to do next."""
     samples: tuple[str, ...] = ()
-    """Names of the samples it is about; empty when it is about all."""
+    """Names of the affected samples; empty when all are."""
 
     def __str__(self) -> str:
         return self.message

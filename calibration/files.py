@@ -1,4 +1,4 @@
-"""Files that are whole or not there, and are never written over."""
+"""Atomic writing of files that are never overwritten."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ from pathlib import Path
 
 
 def write_new(path: Path, content: bytes) -> bool:
-    """Write `content` to `path` unless a file is there; return whether it was written.
+    """Write `content` to `path` unless that file exists; return whether it was written.
 
     A hard link puts the finished file in its place, which fails when the name is taken: two writers cannot both win,
     and a crash leaves at most a temporary file.
     """
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     try:
-        with os.fdopen(handle, "wb") as file:
+        with os.fdopen(descriptor, "wb") as file:
             file.write(content)
             file.flush()
             os.fsync(file.fileno())
-        os.chmod(name, 0o644)
+        os.chmod(name, 0o644)  # mkstemp's 0o600 would keep other users from reading a result
         try:
             os.link(name, path)
         except FileExistsError:

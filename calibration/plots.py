@@ -1,92 +1,90 @@
-"""Plots as SVG text, enough for a report: bars, points, a map of counts."""
+"""Plots of the report as SVG text: bars, points in an image, a map of counts, rotation vectors."""
 
 from __future__ import annotations
 
+import io
 from collections.abc import Sequence
-from html import escape
+from typing import Any
 
+import matplotlib as mpl
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import to_rgba
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
 
-BLUE, RED, GREY = "#2b6cb0", "#c53030", "#a0aec0"
+_BLUE, _RED, _GREY = "#2b6cb0", "#c53030", "#a0aec0"
+# Text stays text, and a fixed salt makes the element names, and so the file, the same each time
+_STYLE: Any = {"svg.fonttype": "none", "svg.hashsalt": "calibration", "font.size": 8.0}
+_NO_METADATA: Any = dict.fromkeys(("Creator", "Date", "Format", "Type"))
 
-_WIDTH, _HEIGHT, _LEFT, _FOOT, _TOP = 560, 240, 52, 40, 14
 
-
-def bars(names: Sequence[str], series: dict[str, np.ndarray], unit: str, marked: Sequence[str] = ()) -> str:
-    """Return bars side by side for each name; names in `marked` are drawn red."""
+def plot_bars(names: Sequence[str], series: dict[str, np.ndarray], unit: str, marked: Sequence[str] = ()) -> str:
+    """Return grouped bars with their values for each name; names in `marked` are drawn red."""
     top = max(float(np.max(values)) for values in series.values()) or 1.0
-    # one wild sample must not flatten all others
+    # Four medians: one outlier must not flatten all other bars
     typical = 4.0 * max(float(np.median(values)) for values in series.values())
     top = min(top, typical) if typical > 0.0 else top
-    step = (_WIDTH - _LEFT - 8) / max(len(names), 1)
-    width = 0.8 * step / len(series)
-    parts = [_axis(top, unit)]
+    figure, (axes,) = _new_figure(5.8, 2.6)
+    width = 0.8 / len(series)
     for k, (label, values) in enumerate(series.items()):
-        for i, (name, value) in enumerate(zip(names, values, strict=True)):
-            height = min(float(value) / top, 1.0) * (_HEIGHT - _FOOT - _TOP)
-            colour = RED if name in marked else (GREY if k < len(series) - 1 else BLUE)
-            hint = f"<title>{escape(f'{name} {label}: {value:.3g} {unit}')}</title>"
-            parts.append(
-                f'<rect x="{_LEFT + i * step + k * width:.1f}" y="{_HEIGHT - _FOOT - height:.1f}" width="{width:.1f}" '
-                f'height="{height:.1f}" fill="{colour}">{hint}</rect>'
-            )
-    every = max(1, len(names) // 12)
-    parts += [
-        _text(_LEFT + (i + 0.4) * step, _HEIGHT - _FOOT + 14, name, "middle")
-        for i, name in list(enumerate(names))[::every]
-    ]
-    legend = " · ".join(series) + (" (red: left out; bars may be cut at the top)" if marked else "")
-    return _svg(_WIDTH, _HEIGHT, [*parts, _text(_LEFT, _HEIGHT - 6, legend, "start")])
+        x = np.arange(len(names)) + (k - 0.5 * (len(series) - 1)) * width
+        colour = _BLUE if k == len(series) - 1 else _GREY
+        drawn = axes.bar(
+            x,
+            np.minimum(values, top),
+            width,
+            label=label,
+            color=[_RED if name in marked else colour for name in names],
+        )
+        axes.bar_label(drawn, [f"{value:.2g}" for value in values], rotation=90, fontsize=5, padding=1)
+    axes.set(ylabel=f"{', '.join(series)} [{unit}]", ylim=(0.0, 1.15 * top))
+    axes.set_xticks(np.arange(len(names)), names, rotation=90 if len(names) > 12 else 0)
+    return _svg(figure)
 
 
-def points(at: np.ndarray, size: tuple[int, int], caption: str) -> str:
+def plot_points(pixels_px: np.ndarray, size: tuple[int, int]) -> str:
     """Return a map of points (N, 2) [px] in an image of `size`."""
-    width, height = size
-    radius = max(width, height) / 250
-    dots = "".join(f'<circle cx="{u:.1f}" cy="{v:.1f}" r="{radius:.1f}"/>' for u, v in at)
-    frame = f'<rect width="{width}" height="{height}" fill="none" stroke="{GREY}" stroke-width="{radius:.1f}"/>'
-    inner = f'<svg viewBox="0 0 {width} {height}" height="200"><g fill="{BLUE}" opacity="0.5">{dots}</g>{frame}</svg>'
-    return f"<figure>{inner}<figcaption>{escape(caption)}</figcaption></figure>"
+    figure, (axes,) = _new_figure(3.6, 2.7)
+    axes.plot(*pixels_px.T, ".", color=_BLUE, alpha=0.5, markersize=2)
+    axes.set(xlim=(-0.5, size[0] - 0.5), ylim=(size[1] - 0.5, -0.5), aspect="equal", xlabel="u [px]", ylabel="v [px]")
+    return _svg(figure)
 
 
-def counts(cells: np.ndarray, caption: str) -> str:
-    """Return a map of counts (R, C): the darker the more, red where there is none."""
-    rows, columns = cells.shape
-    parts = []
-    for (row, column), n in np.ndenumerate(cells):
-        fill = f'fill="{BLUE}" fill-opacity="{0.15 + 0.85 * n / max(cells.max(), 1):.2f}"' if n else f'fill="{RED}"'
-        parts.append(f'<rect x="{40 * column}" y="{40 * row}" width="39" height="39" {fill}/>')
-        parts.append(_text(40 * column + 20, 40 * row + 25, str(n), "middle"))
-    return f"<figure>{_svg(40 * columns, 40 * rows, parts)}<figcaption>{escape(caption)}</figcaption></figure>"
+def plot_counts(cells: np.ndarray) -> str:
+    """Return a map of counts (R, C): darker for more, red for zero."""
+    figure, (axes,) = _new_figure(0.5 * cells.shape[1], 0.5 * cells.shape[0])
+    axes.set(xlim=(-0.5, cells.shape[1] - 0.5), ylim=(cells.shape[0] - 0.5, -0.5), xticks=[], yticks=[])
+    for (row, column), count in np.ndenumerate(cells):
+        alpha = 0.15 + 0.85 * count / max(cells.max(), 1)
+        colour = to_rgba(_BLUE, alpha) if count else _RED
+        axes.add_patch(Rectangle((column - 0.5, row - 0.5), 1.0, 1.0, facecolor=colour, edgecolor="white"))
+        axes.text(column, row, str(count), ha="center", va="center")
+    return _svg(figure)
 
 
-def directions(vectors: np.ndarray, caption: str) -> str:
-    """Return vectors (N, 3) in three views, x-y, x-z and y-z, with a common scale."""
-    reach = 1.1 * max(float(np.abs(vectors).max(initial=0.0)), 1e-9)
-    parts = []
-    for k, (a, b) in enumerate(((0, 1), (0, 2), (1, 2))):
-        left = 10 + 185 * k
-        parts.append(f'<rect x="{left}" y="10" width="170" height="170" fill="none" stroke="{GREY}"/>')
-        parts.append(f'<path d="M{left} 95h170M{left + 85} 10v170" stroke="{GREY}" stroke-width="0.5"/>')
-        parts.append(_text(left + 164, 92, "xyz"[a], "end") + _text(left + 89, 22, "xyz"[b], "start"))
-        for v in vectors:
-            x, y = left + 85 * (1 + v[a] / reach), 10 + 85 * (1 - v[b] / reach)
-            parts.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3" fill="{BLUE}"/>')
-    return f"<figure>{_svg(560, 190, parts)}<figcaption>{escape(f'{caption}; edge {reach:.0f}')}</figcaption></figure>"
+def plot_rotations(vectors_deg: np.ndarray) -> str:
+    """Return rotation vectors (N, 3) [°] in three views, x-y, x-z and y-z, with a common scale."""
+    limit = 1.1 * max(float(np.abs(vectors_deg).max(initial=0.0)), 1e-9)
+    figure, all_axes = _new_figure(7.0, 2.4, columns=3)
+    for axes, (a, b) in zip(all_axes, ((0, 1), (0, 2), (1, 2)), strict=True):
+        axes.plot(vectors_deg[:, a], vectors_deg[:, b], "o", color=_BLUE, markersize=3)
+        axes.axhline(0.0, color=_GREY, linewidth=0.5)
+        axes.axvline(0.0, color=_GREY, linewidth=0.5)
+        axes.set(xlim=(-limit, limit), ylim=(-limit, limit), aspect="equal")
+        axes.set(xlabel=f"{'xyz'[a]} [°]", ylabel=f"{'xyz'[b]} [°]")
+    return _svg(figure)
 
 
-def _axis(top: float, unit: str) -> str:
-    lines = []
-    for share in (0.0, 0.5, 1.0):
-        y = _HEIGHT - _FOOT - share * (_HEIGHT - _FOOT - _TOP)
-        lines.append(f'<path d="M{_LEFT} {y:.1f}H{_WIDTH}" stroke="{GREY}" stroke-width="0.5"/>')
-        lines.append(_text(_LEFT - 4, y + 4, f"{share * top:.2g} {unit}", "end"))
-    return "".join(lines)
+def _new_figure(width_in: float, height_in: float, columns: int = 1) -> tuple[Figure, list[Axes]]:
+    with mpl.rc_context(_STYLE):
+        # Not pyplot: its figures are global, and it would pick a window toolkit
+        figure = Figure(figsize=(width_in, height_in), layout="constrained")
+        return figure, list(figure.subplots(1, columns, squeeze=False)[0])
 
 
-def _text(x: float, y: float, words: str, anchor: str) -> str:
-    return f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}">{escape(words)}</text>'
-
-
-def _svg(width: int, height: int, parts: Sequence[str]) -> str:
-    return f'<svg viewBox="0 0 {width} {height}" width="{width}" font-size="11">{"".join(parts)}</svg>'
+def _svg(figure: Figure) -> str:
+    text = io.StringIO()
+    with mpl.rc_context(_STYLE):
+        figure.savefig(text, format="svg", metadata=_NO_METADATA)
+    return text.getvalue()[text.getvalue().index("<svg") :]  # without the XML declaration, which HTML does not allow

@@ -1,79 +1,90 @@
-"""One HTML file, complete in itself, that shows whether a calibration can be trusted."""
+"""Report of a calibration: one self-contained HTML file with its accuracy and its samples."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from html import escape
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from calibration import plots
 from calibration.board.detection import BoardView
 from calibration.hand_eye.result import HandEyeResult
 from calibration.hand_eye.uncertainty import COVERAGE
 from calibration.intrinsics import IntrinsicsResult
-from calibration.results import Calibration
-from calibration.transforms import distance, inverse, rotation_vectors
-
-_STYLE = """body{font:15px/1.5 system-ui,sans-serif;max-width:62rem;margin:2rem auto;padding:0 1rem;color:#1a202c}
-h1,h2{line-height:1.2}figure{margin:1rem 0}figcaption{color:#4a5568}table{border-collapse:collapse}
-td,th{padding:.2rem .8rem .2rem 0;text-align:left;border-bottom:1px solid #e2e8f0;vertical-align:top}
-pre{background:#f7fafc;padding:.6rem}.warn{background:#fffaf0;border-left:4px solid #dd6b20;padding:.4rem .8rem}"""
+from calibration.pose_checks import pose_distances_mm_deg
+from calibration.results import CalibrationResult
+from hal.base.transforms import inverse, rotation_vectors
 
 
 def write_report(
     path: Path,
-    calibration: Calibration,
+    calibration: CalibrationResult,
     result: HandEyeResult | IntrinsicsResult,
     *,
     views: Sequence[BoardView] = (),
     Ts_base_flange: np.ndarray | None = None,
-    T_mount_camera_truth: np.ndarray | None = None,
+    ground_truth: np.ndarray | None = None,
 ) -> None:
     """Write the report of `result`.
 
     Args:
         path: of the HTML file; it is replaced.
-        calibration: the result's origin, as saved.
-        result: what is shown.
-        views: one a sample, for the map of where corners were seen.
+        calibration: the result as saved, with its origin.
+        result: the solver's result.
+        views: one a sample, for the map of detected corners.
         Ts_base_flange: (N, 4, 4) the arm's poses, for the spread of the rotation axes (hand-eye).
-        T_mount_camera_truth: (4, 4) the true camera pose, where it is known.
+        ground_truth: (4, 4) true T_mount_camera, where it is known.
     """
     if isinstance(result, HandEyeResult):
-        title, body = "Hand-eye calibration", _hand_eye(result, Ts_base_flange, T_mount_camera_truth)
+        content = _hand_eye_content(result, Ts_base_flange, ground_truth)
     else:
-        title, body = "Camera calibration", _intrinsics(result)
-    parts = [f"<h1>{title}</h1>", _origin(calibration), _doubts(calibration), *body]
+        content = _intrinsics_content(result)
     if views:
-        pixels = np.vstack([view.pixels_px for view in views])
-        parts += ["<h2>Coverage</h2>", plots.points(pixels, views[0].image_size, "All corners seen, in the image.")]
-    head = f"<!doctype html><html lang='en'><meta charset='utf-8'><title>{title}</title><style>{_STYLE}</style>"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(head + "\n".join(parts) + "</html>\n", encoding="utf-8")
-
-
-def _origin(calibration: Calibration) -> str:
-    board, used, dropped = calibration.board, calibration.samples["used"], calibration.samples["dropped"]
-    return _table(
-        {
-            "Camera": calibration.serial,
-            "Date": calibration.date,
-            "File": str(calibration.path or "not saved"),
-            "Board": f"{board.columns} × {board.rows}, squares {1e3 * board.square_m:g} mm, {board.dictionary}",
-            "Samples": f"{len(used)} used, {len(dropped)} left out, from {calibration.samples['folder']}",
-            **{f"left out: {name}": reason for name, reason in dropped.items()},
-        }
+        corners = plots.plot_points(np.vstack([view.pixels_px for view in views]), views[0].image_size)
+        content["sections"]["Coverage"] = [(corners, "All detected corners in the image.")]
+    environment = Environment(loader=PackageLoader("calibration"), autoescape=True, undefined=StrictUndefined)
+    html = environment.get_template("report.html.j2").render(
+        origin=_origin(calibration), warnings=calibration.quality_warnings(), **content
     )
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(html + "\n", encoding="utf-8")
 
 
-def _doubts(calibration: Calibration) -> str:
-    return "".join(f"<p class='warn'>{escape(doubt)}</p>" for doubt in calibration.doubts())
+def _origin(calibration: CalibrationResult) -> dict[str, str]:
+    board, used, dropped = calibration.board, calibration.samples["used"], calibration.samples["dropped"]
+    return {
+        "Camera": calibration.serial,
+        "Date": calibration.date,
+        "File": str(calibration.path or "not saved"),
+        "Board": f"{board.columns} × {board.rows}, squares {1e3 * board.square_m:g} mm, {board.dictionary}",
+        "Samples": f"{len(used)} used, {len(dropped)} left out, from {calibration.samples['folder']}",
+        **{f"left out: {name}": reason for name, reason in dropped.items()},
+    }
 
 
-def _hand_eye(result: HandEyeResult, Ts_base_flange: np.ndarray | None, truth: np.ndarray | None) -> list[str]:
+def _hand_eye_content(
+    result: HandEyeResult, Ts_base_flange: np.ndarray | None, ground_truth: np.ndarray | None
+) -> dict[str, Any]:
     mount = "flange" if result.setup == "eye_in_hand" else "base"
+    sections = _residual_sections(result)
+    if Ts_base_flange is not None:
+        Ts_mount = Ts_base_flange if result.setup == "eye_in_hand" else inverse(Ts_base_flange)
+        turns_deg = np.degrees(rotation_vectors(np.swapaxes(Ts_mount[:1, :3, :3], 1, 2) @ Ts_mount[:, :3, :3]))
+        caption = f"Rotation from the first sample, axis times angle in {mount} axes [°]."
+        sections["Spread of the rotations"] = [(plots.plot_rotations(turns_deg), caption)]
+    return {
+        "title": "Hand-eye calibration",
+        "figures": _hand_eye_figures(result, ground_truth),
+        "matrix": (f"T_{mount}_camera", _format_matrix(result.T_mount_camera)),
+        "sections": sections,
+        "methods": _method_rows(result, ground_truth),
+    }
+
+
+def _hand_eye_figures(result: HandEyeResult, ground_truth: np.ndarray | None) -> dict[str, str]:
     percent = f"{100 * COVERAGE:g} %"
     figures = {
         f"True position is within ({percent})": f"{result.uncertainty_mm:.2f} mm",
@@ -86,44 +97,47 @@ def _hand_eye(result: HandEyeResult, Ts_base_flange: np.ndarray | None, truth: n
     }
     if result.square_m is not None:
         figures["Squares as the arm measures them"] = f"{1e3 * result.square_m:.2f} mm"
-    if truth is not None:
-        mm, deg = distance(result.T_mount_camera, truth)
-        figures["Error against the truth"] = f"{mm:.3f} mm, {deg:.4f}°"
-    left_out = tuple(result.dropped)
-    parts = [_table(figures), f"<h2>T_{mount}_camera</h2><pre>{_matrix(result.T_mount_camera)}</pre>"]
-    parts.append("<h2>Residual of each sample</h2>")
-    parts.append(plots.bars(result.sample_names, {"position": result.residuals_mm}, "mm", left_out))
-    parts.append(plots.bars(result.sample_names, {"orientation": result.residuals_deg}, "°", left_out))
+    if ground_truth is not None:
+        mm, deg = pose_distances_mm_deg(result.T_mount_camera, ground_truth)
+        figures["Error against the ground truth"] = f"{mm:.3f} mm, {deg:.4f}°"
+    return figures
+
+
+def _residual_sections(result: HandEyeResult) -> dict[str, list[tuple[str, str]]]:
+    names, dropped = result.sample_names, tuple(result.dropped)
+    caption = "Red: left out. Bars may be cut at the top." if dropped else ""
+    sections = {
+        "Residual of each sample": [
+            (plots.plot_bars(names, {"position": result.residuals_mm}, "mm", dropped), caption),
+            (plots.plot_bars(names, {"orientation": result.residuals_deg}, "°", dropped), caption),
+        ]
+    }
     if result.residuals_px is not None:
         series = {} if result.initial_px is None else {"closed form": result.initial_px}
-        parts.append("<h2>Reprojection before and after the joint refinement</h2>")
-        parts.append(plots.bars(result.sample_names, series | {"refined": result.residuals_px}, "px", left_out))
-    if Ts_base_flange is not None:
-        T_mounts = Ts_base_flange if result.setup == "eye_in_hand" else inverse(Ts_base_flange)
-        turns = np.degrees(rotation_vectors(np.swapaxes(T_mounts[:1, :3, :3], 1, 2) @ T_mounts[:, :3, :3]))
-        parts.append("<h2>Spread of the rotations</h2>")
-        parts.append(plots.directions(turns, f"Rotation from the first sample, axis times angle in {mount} axes [°]"))
-    parts.append("<h2>Methods</h2>" + _methods(result, truth))
-    return parts
+        plot = plots.plot_bars(names, series | {"refined": result.residuals_px}, "px", dropped)
+        legend = "Blue: refined; grey: closed form." if series else "Blue: refined."
+        sections["Reprojection before and after the joint refinement"] = [(plot, f"{legend} {caption}".strip())]
+    return sections
 
 
-def _methods(result: HandEyeResult, truth: np.ndarray | None) -> str:
-    rows = [("refined" if result.residuals_px is not None else "weighted", result.T_mount_camera)]
-    rows += [(method.name, method.T_mount_camera) for method in result.methods]
-    spread = {method.name: f"{method.rms_mm:.2f} mm, {method.rms_deg:.3f}°" for method in result.methods}
-    lines = [
-        "<tr><th>method</th><th>position [mm]</th><th>spread</th><th>from the result</th><th>from the truth</th></tr>"
+def _method_rows(result: HandEyeResult, ground_truth: np.ndarray | None) -> list[tuple[str, ...]]:
+    """Return name, position, spread, and differences from the result and the ground truth of each method."""
+    name = "refined" if result.residuals_px is not None else "weighted"
+    found = [(name, result.T_mount_camera, result.rms_mm, result.rms_deg)]
+    found += [(method.name, method.T_mount_camera, method.rms_mm, method.rms_deg) for method in result.methods]
+    return [
+        (
+            name,
+            ", ".join(f"{1e3 * value:.2f}" for value in T[:3, 3]),
+            f"{rms_mm:.2f} mm, {rms_deg:.3f}°",
+            _format_difference(result.T_mount_camera, T),
+            "unknown" if ground_truth is None else _format_difference(ground_truth, T),
+        )
+        for name, T, rms_mm, rms_deg in found
     ]
-    for name, T in rows:
-        away = "{:.2f} mm, {:.3f}°".format(*distance(result.T_mount_camera, T))
-        wrong = "unknown" if truth is None else "{:.2f} mm, {:.3f}°".format(*distance(truth, T))
-        place = ", ".join(f"{1e3 * value:.2f}" for value in T[:3, 3])
-        own = spread.get(name, f"{result.rms_mm:.2f} mm, {result.rms_deg:.3f}°")
-        lines.append("<tr>" + "".join(f"<td>{cell}</td>" for cell in (name, place, own, away, wrong)) + "</tr>")
-    return f"<table>{''.join(lines)}</table>"
 
 
-def _intrinsics(result: IntrinsicsResult) -> list[str]:
+def _intrinsics_content(result: IntrinsicsResult) -> dict[str, Any]:
     matrix = result.camera.matrix
     values = (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *result.camera.distortion)
     names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
@@ -132,18 +146,23 @@ def _intrinsics(result: IntrinsicsResult) -> list[str]:
         for i, (name, value, sd) in enumerate(zip(names, values, result.sd, strict=True))
     }
     figures |= {"Reprojection (rms)": f"{result.rms_px:.3f} px", "Hold-out error (rms)": f"{result.holdout_px:.3f} px"}
-    return [
-        _table(figures),
-        "<h2>Error of each view</h2>",
-        plots.bars(result.view_names, {"reprojection": result.view_errors_px}, "px", tuple(result.refused)),
-        plots.counts(result.coverage, "Corners seen in each part of the image, views left out not counted."),
-    ]
+    rejected = tuple(result.rejected)
+    errors = plots.plot_bars(result.view_names, {"reprojection": result.view_errors_px}, "px", rejected)
+    caption = "Red: left out. Bars may be cut at the top." if rejected else ""
+    coverage = "Corners detected in each part of the image; views left out are not counted."
+    return {
+        "title": "Camera calibration",
+        "figures": figures,
+        "matrix": None,
+        "sections": {"Error of each view": [(errors, caption), (plots.plot_counts(result.coverage), coverage)]},
+        "methods": [],
+    }
 
 
-def _table(rows: dict[str, str]) -> str:
-    lines = (f"<tr><th>{escape(name)}</th><td>{escape(value)}</td></tr>" for name, value in rows.items())
-    return f"<table>{''.join(lines)}</table>"
+def _format_difference(T_a: np.ndarray, T_b: np.ndarray) -> str:
+    mm, deg = pose_distances_mm_deg(T_a, T_b)
+    return f"{mm:.2f} mm, {deg:.3f}°"
 
 
-def _matrix(T: np.ndarray) -> str:
+def _format_matrix(T: np.ndarray) -> str:
     return "\n".join(" ".join(f"{value: .6f}" for value in row) for row in T)

@@ -1,4 +1,4 @@
-"""Results on disk: versioned, with their origin, never overwritten and never half-written.
+"""Calibration results on disk: versioned, with their origin, written atomically and never overwritten.
 
 `hand_eye_<serial>_v0001.json`, `intrinsics_<serial>_v0001.json`, … The newest is the one with the highest number.
 """
@@ -20,7 +20,7 @@ from calibration.errors import CalibrationError, CalibrationWarning
 from calibration.files import write_new
 from calibration.hand_eye.result import HandEyeResult, Setup
 from calibration.intrinsics import IntrinsicsResult
-from calibration.transforms import check_poses
+from calibration.pose_checks import check_poses
 from hal.base.errors import InvalidValueError
 
 logger = logging.getLogger(__name__)
@@ -28,36 +28,36 @@ logger = logging.getLogger(__name__)
 Kind = Literal["hand_eye", "intrinsics"]
 
 FORMAT = 1
-"""Of the files; one that a newer version wrote is refused rather than guessed at."""
+"""Version of the file format; another one is rejected."""
 MAX_UNCERTAINTY_MM = 1.0
-"""A hand-eye result less certain than this is used with a warning."""
+"""A hand-eye result with a larger uncertainty is used with a warning."""
 MAX_UNCERTAINTY_DEG = 0.2
 """The same for its orientation."""
 MAX_RMS_PX = 0.5
-"""Intrinsics with a greater reprojection error are used with a warning."""
+"""Intrinsics with a larger reprojection error are used with a warning."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Calibration:
+class CalibrationResult:
     """One result with its origin."""
 
     kind: Kind
-    """What was calibrated."""
+    """The calibrated quantity."""
     serial: str
     """The camera's serial number."""
     date: str
-    """When, ISO 8601, from the caller."""
+    """ISO 8601, from the caller."""
     board: Board
-    """With which board."""
+    """The board used."""
     camera: CameraModel
-    """The camera found (intrinsics) or used (hand-eye)."""
+    """The estimated camera (intrinsics) or the assumed one (hand-eye)."""
     samples: dict[str, Any]
     """`folder`, `used` (names), `dropped` (name: reason)."""
     errors: dict[str, float]
     """hand_eye: `uncertainty_mm`, `uncertainty_deg`, `rms_mm`, `rms_deg`, `holdout_mm`, `holdout_deg`, `diversity`,
     and with refinement `rms_px`. intrinsics: `rms_px`, `holdout_px`."""
     warnings: tuple[CalibrationWarning, ...] = ()
-    """What the solver warned of."""
+    """The solver's warnings."""
     setup: Setup | None = None
     """Of a hand-eye result."""
     T_mount_camera: np.ndarray | None = None
@@ -67,27 +67,32 @@ class Calibration:
     covariance: np.ndarray | None = None
     """(6, 6) of a hand-eye result, as `HandEyeResult.covariance`."""
     path: Path | None = None
-    """The file it was read from."""
+    """The file of the result."""
 
     def __post_init__(self) -> None:
         if self.kind not in get_args(Kind) or not self.serial or not self.date:
-            raise CalibrationError("bad_result", f"a {self.kind!r} of camera {self.serial!r}, dated {self.date!r}?")
+            raise CalibrationError(
+                f"invalid result: kind, serial and date are required ({self.kind!r}, {self.serial!r}, {self.date!r}).",
+                code="bad_result",
+            )
         if self.kind == "hand_eye":
             if self.setup not in get_args(Setup) or self.T_mount_camera is None or self.T_anchor_board is None:
                 raise CalibrationError(
-                    "bad_result", f"a hand-eye result needs setup and poses; setup is {self.setup!r}."
+                    f"invalid hand-eye result: setup ({self.setup!r}) and poses are required.", code="bad_result"
                 )
             check_poses(np.array([self.T_mount_camera, self.T_anchor_board]), "T_mount_camera, T_anchor_board")
         numbers = [*self.errors.values(), *([] if self.covariance is None else np.ravel(self.covariance))]
         if not np.isfinite(np.array(numbers, dtype=np.float64)).all():
-            raise CalibrationError("bad_result", f"errors {self.errors} or covariance are not finite.")
+            raise CalibrationError(
+                f"invalid result: errors {self.errors} or covariance are not finite.", code="bad_result"
+            )
 
     @property
     def T_flange_camera(self) -> np.ndarray:
         """(4, 4) the camera on the flange.
 
         Raises:
-            CalibrationError: not a hand-eye result, or one of an eye to hand.
+            CalibrationError: `wrong_setup`: not a hand-eye result, or an eye-to-hand one.
         """
         return self._pose_of("eye_in_hand")
 
@@ -96,14 +101,15 @@ class Calibration:
         """(4, 4) the camera in the base.
 
         Raises:
-            CalibrationError: not a hand-eye result, or one of an eye in hand.
+            CalibrationError: `wrong_setup`: not a hand-eye result, or an eye-in-hand one.
         """
         return self._pose_of("eye_to_hand")
 
     def _pose_of(self, setup: Setup) -> np.ndarray:
         if self.setup != setup or self.T_mount_camera is None:
-            what = self.kind if self.setup is None else self.setup
-            raise CalibrationError("wrong_setup", f"{self} is of {what}; an {setup} is needed.")
+            raise CalibrationError(
+                f"{self}: wrong setup ({self.setup or self.kind}, needed {setup}).", code="wrong_setup"
+            )
         return self.T_mount_camera
 
     def __str__(self) -> str:
@@ -111,13 +117,13 @@ class Calibration:
         place = "" if self.path is None else f" in {self.path}"
         return f"{self.kind} of camera {self.serial}, {self.date}{place} ({figures})"
 
-    def doubts(self) -> list[str]:
-        """Return what speaks against using this result: figures above the thresholds, and the solver's warnings."""
+    def quality_warnings(self) -> list[str]:
+        """Return messages about figures above the thresholds, and the solver's warnings."""
         limits = {"uncertainty_mm": MAX_UNCERTAINTY_MM, "uncertainty_deg": MAX_UNCERTAINTY_DEG}
         if self.kind == "intrinsics":
             limits = {"rms_px": MAX_RMS_PX}
         above = [
-            f"{name} is {self.errors[name]:.3g}, up to {limit:g} is good: calibrate again"
+            f"{name} is {self.errors[name]:.3g}, up to {limit:g} is good; calibrate again"
             for name, limit in limits.items()
             if self.errors.get(name, 0.0) > limit
         ]
@@ -126,8 +132,8 @@ class Calibration:
     @classmethod
     def of_hand_eye(
         cls, result: HandEyeResult, *, serial: str, date: str, board: Board, camera: CameraModel, folder: str
-    ) -> Calibration:
-        """Return `result` with its origin; `folder` is where its samples are."""
+    ) -> CalibrationResult:
+        """Return `result` with its origin; `folder` holds its samples."""
         names = ("uncertainty_mm", "uncertainty_deg", "rms_mm", "rms_deg", "holdout_mm", "holdout_deg", "diversity")
         errors = {name: float(getattr(result, name)) for name in names}
         if result.rms_px is not None:
@@ -150,15 +156,15 @@ class Calibration:
     @classmethod
     def of_intrinsics(
         cls, result: IntrinsicsResult, *, serial: str, date: str, board: Board, folder: str
-    ) -> Calibration:
-        """Return `result` with its origin; `folder` is where its samples are."""
+    ) -> CalibrationResult:
+        """Return `result` with its origin; `folder` holds its samples."""
         return cls(
             kind="intrinsics",
             serial=serial,
             date=date,
             board=board,
             camera=result.camera,
-            samples=_origin(folder, result.view_names, result.refused),
+            samples=_origin(folder, result.view_names, result.rejected),
             errors={"rms_px": result.rms_px, "holdout_px": result.holdout_px},
             warnings=result.warnings,
         )
@@ -168,7 +174,7 @@ def _origin(folder: str, names: tuple[str, ...], dropped: dict[str, str]) -> dic
     return {"folder": folder, "used": [name for name in names if name not in dropped], "dropped": dict(dropped)}
 
 
-def save_result(folder: Path, calibration: Calibration) -> Path:
+def save_result(folder: Path, calibration: CalibrationResult) -> Path:
     """Write the next version into `folder` and return its path; no file that exists is ever touched."""
     folder.mkdir(parents=True, exist_ok=True)
     arrays = ("T_mount_camera", "T_anchor_board", "covariance")
@@ -202,34 +208,35 @@ def _version(path: Path, stem: str) -> int:
     return int(match[1]) if match else 0
 
 
-def load_result(path: Path, *, serial: str | None = None) -> Calibration:
-    """Return the result in `path`, and log which it is and whatever is doubtful about it.
+def load_result(path: Path, *, serial: str | None = None) -> CalibrationResult:
+    """Return the result in `path`, and log its summary and its quality warnings.
 
     Raises:
-        CalibrationError: `damaged_result`, `missing_result`, or `wrong_serial` (it is of another camera than `serial`).
+        CalibrationError: `damaged_result`, `missing_result`, or `wrong_serial` (of another camera than `serial`).
     """
     found = _read(path)
     if serial is not None and found.serial != serial:
         raise CalibrationError(
-            "wrong_serial",
-            f"{path} is of camera {found.serial}, and this one is {serial}: calibrate it, or give its own file.",
+            f"{path}: result of camera {found.serial}, the connected camera is {serial}. Calibrate it, or give "
+            "its own file.",
+            code="wrong_serial",
         )
     logger.info("calibration: %s", found)
-    for doubt in found.doubts():
-        logger.warning("calibration %s: %s", path.name, doubt)
+    for message in found.quality_warnings():
+        logger.warning("calibration %s: %s", path.name, message)
     return found
 
 
-def _read(path: Path) -> Calibration:
+def _read(path: Path) -> CalibrationResult:
     try:
         values = json.loads(path.read_text())
         if values["format"] != FORMAT:
-            raise InvalidValueError(f"its format is {values['format']!r}, known is {FORMAT}")
+            raise InvalidValueError(f"unknown format ({values['format']!r}, known: {FORMAT})")
         arrays = {
             name: None if values[name] is None else np.array(values[name], dtype=np.float64)
             for name in ("T_mount_camera", "T_anchor_board", "covariance")
         }
-        return Calibration(
+        return CalibrationResult(
             kind=values["kind"],
             serial=values["serial"],
             date=values["date"],
@@ -246,16 +253,21 @@ def _read(path: Path) -> Calibration:
             **arrays,
         )
     except FileNotFoundError as error:
-        raise CalibrationError("missing_result", f"there is no calibration {path}.") from error
+        raise CalibrationError(
+            f"there is no calibration result {path}. Run `./z1 calibrate`, or give another file.", code="missing_result"
+        ) from error
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise CalibrationError("damaged_result", f"{path} is no calibration result: {error!r}.") from error
+        raise CalibrationError(
+            f"{path}: this is no calibration result ({error!r}). Calibrate again, or give another file.",
+            code="damaged_result",
+        ) from error
 
 
-def load_newest(folder: Path, kind: Kind, serial: str) -> Calibration:
+def load_newest(folder: Path, kind: Kind, serial: str) -> CalibrationResult:
     """Return the newest valid result of this camera; damaged ones are skipped with a message.
 
     Raises:
-        CalibrationError: `missing_result` (none of this camera; those of others are listed).
+        CalibrationError: `missing_result` (none of this camera; the message lists the others).
     """
     files = sorted(folder.iterdir()) if folder.is_dir() else []
     stem = _stem(kind, serial)
@@ -266,6 +278,6 @@ def load_newest(folder: Path, kind: Kind, serial: str) -> Calibration:
             logger.warning("calibration skipped: %s", error)
     others = ", ".join(p.name for p in files if p.suffix == ".json") or "nothing"
     raise CalibrationError(
-        "missing_result",
-        f"{folder} holds no valid {kind} calibration of camera {serial}, but {others}; run `./z1 calibrate`.",
+        f"{folder}: no valid {kind} calibration of camera {serial} (found: {others}). Run `./z1 calibrate`.",
+        code="missing_result",
     )

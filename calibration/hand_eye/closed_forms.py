@@ -1,4 +1,7 @@
-"""Hand-eye in closed form: OpenCV's five methods, its two for robot-world and hand-eye, and a robust start."""
+"""Closed forms of hand-eye calibration, and robust initial poses for the least squares.
+
+The closed forms are OpenCV's five methods for AX = XB, its two for AX = ZB, and one of our own for subsets.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,7 @@ from collections.abc import Iterator
 import cv2
 import numpy as np
 
-from calibration.transforms import inverse, rotation_vectors
+from hal.base.transforms import inverse, make_pose, rotation_vectors
 
 HAND_EYE = {
     "tsai": cv2.CALIB_HAND_EYE_TSAI,
@@ -18,49 +21,51 @@ HAND_EYE = {
 }
 ROBOT_WORLD = {"shah": cv2.CALIB_ROBOT_WORLD_HAND_EYE_SHAH, "li": cv2.CALIB_ROBOT_WORLD_HAND_EYE_LI}
 
-_SUBSET = 5  # samples a guess is made from: few enough to be free of bad ones, enough to turn about two axes
-_GUESSES = 60  # with 3 bad samples in 10 one guess in 12 is clean: all 60 are spoilt once in 200 times
-_GOOD_SHARE = 0.4  # a guess is judged by this share of the samples, so the others may be bad or after a move
+_SUBSET = 5  # samples of a hypothesis: few enough to be free of outliers, enough to turn about two axes
+_HYPOTHESES = 60  # with 3 outliers in 10 samples one subset in 12 has none: all 60 have one once in 200 times
+_INLIER_RATIO = 0.4  # a hypothesis is rated by this ratio of the samples: the others may be outliers or after a move
+_MM_PER_DEG = 5.0  # what a degree does to a board 0.3 m from the camera
 
 
-def all_closed_forms(Ts_anchor_mount: np.ndarray, Ts_camera_board: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
-    """Yield the name and T_mount_camera (4, 4) of each method that gives one; poses are (N, 4, 4).
+def solve_closed_forms(Ts_anchor_mount: np.ndarray, Ts_camera_board: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
+    """Yield the name and T_mount_camera (4, 4) of each method that has a solution; poses are (N, 4, 4).
 
-    OpenCV 5.0 was released without these solvers; then there are none.
+    OpenCV 5.0 was released without these solvers; nothing is yielded there.
     """
     if not hasattr(cv2, "calibrateHandEye"):
         return
-    arm, seen = _split(Ts_anchor_mount), _split(Ts_camera_board)
+    arm, boards = _split(Ts_anchor_mount), _split(Ts_camera_board)
     arm_inverse = _split(inverse(Ts_anchor_mount))
     for name, method in HAND_EYE.items():
         try:
-            found = cv2.calibrateHandEye(*arm, *seen, method=method)
+            found = cv2.calibrateHandEye(*arm, *boards, method=method)
         except cv2.error:
-            continue  # a method that cannot cope with these poses says so this way
-        yield from _proper(name, *found)
+            continue  # how OpenCV reports that a method has no solution for these poses
+        yield from _orthonormalize(name, *found)
     for name, method in ROBOT_WORLD.items():
         try:
-            _, _, R_camera_mount, p_camera_mount = cv2.calibrateRobotWorldHandEye(*seen, *arm_inverse, method=method)
+            _, _, R_camera_mount, p_camera_mount = cv2.calibrateRobotWorldHandEye(*boards, *arm_inverse, method=method)
         except cv2.error:
             continue
-        yield from _proper(name, R_camera_mount.T, -R_camera_mount.T @ p_camera_mount)
+        yield from _orthonormalize(name, R_camera_mount.T, -R_camera_mount.T @ p_camera_mount)
 
 
 def _split(Ts: np.ndarray) -> tuple[list[np.ndarray], list[np.ndarray]]:
     return [T[:3, :3].copy() for T in Ts], [T[:3, 3:].copy() for T in Ts]
 
 
-def _proper(name: str, R: np.ndarray, p: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
-    """Yield the pose with the nearest rotation, unless it is not finite or turned inside out."""
-    T = np.eye(4)
+def _orthonormalize(name: str, R: np.ndarray, p: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
+    """Yield the pose with the nearest rotation, unless it is not finite or a reflection."""
     if np.isfinite(R).all() and np.isfinite(p).all() and np.linalg.det(R) > 0.0:
         U, _, Vt = np.linalg.svd(R)
-        T[:3, :3], T[:3, 3] = U @ Vt, np.ravel(p)
-        yield name, T
+        yield name, make_pose(U @ Vt, np.ravel(p))
 
 
-def park_martin(Ts_anchor_mount: np.ndarray, Ts_camera_board: np.ndarray) -> np.ndarray:
-    """Return T_mount_camera (4, 4) after Park and Martin (1994), from the motions between all pairs of samples."""
+def solve_park_martin(Ts_anchor_mount: np.ndarray, Ts_camera_board: np.ndarray) -> np.ndarray:
+    """Return T_mount_camera (4, 4) after Park and Martin (1994), from the motions between all pairs of samples.
+
+    OpenCV 5.0 was released without its own.
+    """
     first, second = np.triu_indices(len(Ts_anchor_mount), 1)
     A = inverse(Ts_anchor_mount[first]) @ Ts_anchor_mount[second]  # A X = X B
     B = Ts_camera_board[first] @ inverse(Ts_camera_board[second])
@@ -74,21 +79,23 @@ def park_martin(Ts_anchor_mount: np.ndarray, Ts_camera_board: np.ndarray) -> np.
     return T
 
 
-def robust_start(Ts_anchor_mount: np.ndarray, Ts_camera_board: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return T_mount_camera and T_anchor_board (4, 4) that suit most samples, and how far off those are.
+def estimate_initial_poses(
+    Ts_anchor_mount: np.ndarray, Ts_camera_board: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return T_mount_camera and T_anchor_board (4, 4) that fit most samples, and the error of those samples [mm].
 
-    Guesses are made from few samples each, the same ones every time; the one whose best samples agree best is taken.
-    An error is in millimetres, a degree counting as five of them (what it does to a board 0.3 m away).
+    A RANSAC with fixed subsets: the hypothesis with the lowest error over its best samples wins. The error adds the
+    distance [mm] and the angle, a degree counted as `_MM_PER_DEG`.
     """
     n = len(Ts_anchor_mount)
     rng = np.random.default_rng(0)
-    subsets = [np.arange(n)] + [rng.choice(n, min(_SUBSET, n), replace=False) for _ in range(_GUESSES)]
+    subsets = [np.arange(n)] + [rng.choice(n, min(_SUBSET, n), replace=False) for _ in range(_HYPOTHESES)]
     best: tuple[np.ndarray, np.ndarray, float] | None = None
     for subset in subsets:
-        T_mount_camera = park_martin(Ts_anchor_mount[subset], Ts_camera_board[subset])
+        T_mount_camera = solve_park_martin(Ts_anchor_mount[subset], Ts_camera_board[subset])
         boards = Ts_anchor_mount @ T_mount_camera @ Ts_camera_board
         for T_anchor_board in boards[subset]:
-            error = np.quantile(_errors(boards, T_anchor_board), _GOOD_SHARE)
+            error = np.quantile(_errors(boards, T_anchor_board), _INLIER_RATIO)
             if best is None or error < best[2]:
                 best = T_mount_camera, T_anchor_board, float(error)
     assert best is not None
@@ -98,4 +105,4 @@ def robust_start(Ts_anchor_mount: np.ndarray, Ts_camera_board: np.ndarray) -> tu
 def _errors(boards: np.ndarray, T_anchor_board: np.ndarray) -> np.ndarray:
     cosine = 0.5 * (np.einsum("nij,ij->n", boards[:, :3, :3], T_anchor_board[:3, :3]) - 1.0)
     angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
-    return 1e3 * np.linalg.norm(boards[:, :3, 3] - T_anchor_board[:3, 3], axis=1) + 5.0 * angle
+    return 1e3 * np.linalg.norm(boards[:, :3, 3] - T_anchor_board[:3, 3], axis=1) + _MM_PER_DEG * angle

@@ -1,8 +1,8 @@
-"""Least squares over poses: the hand-eye, where the board is (before and after a move), and the size of its squares.
+"""Least squares over poses: the hand-eye transform, the board's poses (before and after a move), and its scale.
 
-A sample's error e = (position [m], rotation vector [rad]), in camera axes, is how far the board predicted through the
-arm lies from the board seen. Two things make it: the corners, whose noise reaches e through the inverse of their
-Fisher information, and the arm, whose pose scatters by `NoiseLevels` in position and orientation at the flange.
+A sample's residual e = (position [m], rotation vector [rad]), in camera axes, is the difference between the board
+predicted through the arm and the detected board. Its covariance has two parts: the noise of the corners (the inverse
+of their Fisher information) and the scatter of the flange's pose by `NoiseLevels`.
 """
 
 from __future__ import annotations
@@ -12,24 +12,25 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import minimize
 
-from calibration.transforms import inverse, moved, rotation_vectors, skew
+from hal.base.transforms import apply_increment, inverse, rotation_vectors, skew
 
-_SCALE_SD = 0.1  # what is known of a square's size before: nobody mistakes it by more than a tenth without noticing
+_SCALE_SD = 0.1  # prior of the board's scale: a print that is off by more than a tenth is noticed
 _MIN_SCATTER = 1e-6  # [m] and [rad]; an ideal arm would make the weights infinite
+_MAX_SCATTER = 0.3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PoseData:
-    """The samples as poses."""
+    """The samples as poses, for either setup."""
 
     Ts_anchor_mount: np.ndarray
-    """(N, 4, 4) the arm."""
+    """(N, 4, 4) the arm's poses."""
     Ts_camera_board: np.ndarray
-    """(N, 4, 4) the board seen."""
+    """(N, 4, 4) the detected board poses."""
     corner_covariances: np.ndarray
-    """(N, 6, 6) of the board's position and rotation in camera axes, from the noise of the corners."""
+    """(N, 6, 6) of position and rotation of the board in camera axes, from the noise of the corners."""
     camera_on_flange: bool
-    """Which end of the problem the flange is: eye in hand or eye to hand."""
+    """True where the flange is the mount (eye in hand), False where it is the anchor (eye to hand)."""
 
     def __len__(self) -> int:
         return len(self.Ts_anchor_mount)
@@ -42,9 +43,9 @@ class PoseFit:
     T_mount_camera: np.ndarray
     """(4, 4)."""
     Ts_anchor_board: np.ndarray
-    """(G, 4, 4), one a place where the board lay."""
-    place: np.ndarray
-    """(N,) int, which of them holds for each sample."""
+    """(G, 4, 4), one for each placement of the board."""
+    board_index: np.ndarray
+    """(N,) int, index into `Ts_anchor_board` of each sample."""
     scale: float = 1.0
     """True size of the board over that of the settings."""
 
@@ -57,36 +58,36 @@ class NoiseLevels:
     arm_rad: float = 1e-3
 
 
-def predict(data: PoseData, fit: PoseFit) -> np.ndarray:
-    """Return where the arm says the camera sees the board, (N, 4, 4)."""
-    return inverse(data.Ts_anchor_mount @ fit.T_mount_camera) @ fit.Ts_anchor_board[fit.place]
+def predict_board_poses(data: PoseData, fit: PoseFit) -> np.ndarray:
+    """Return T_camera_board (N, 4, 4) of each sample as predicted through the arm."""
+    return inverse(data.Ts_anchor_mount @ fit.T_mount_camera) @ fit.Ts_anchor_board[fit.board_index]
 
 
-def errors(data: PoseData, fit: PoseFit) -> np.ndarray:
-    """Return e (N, 6): position [m] and rotation vector [rad] in camera axes."""
-    predicted, seen = predict(data, fit), data.Ts_camera_board
-    turned = predicted[:, :3, :3] @ np.swapaxes(seen[:, :3, :3], 1, 2)
-    return np.hstack([predicted[:, :3, 3] - fit.scale * seen[:, :3, 3], rotation_vectors(turned)])
+def compute_residuals(data: PoseData, fit: PoseFit) -> np.ndarray:
+    """Return the residuals e (N, 6): position [m] and rotation vector [rad] in camera axes."""
+    predicted, detected = predict_board_poses(data, fit), data.Ts_camera_board
+    R = predicted[:, :3, :3] @ np.swapaxes(detected[:, :3, :3], 1, 2)
+    return np.hstack([predicted[:, :3, 3] - fit.scale * detected[:, :3, 3], rotation_vectors(R)])
 
 
-def slopes(data: PoseData, fit: PoseFit) -> np.ndarray:
-    """Return the derivatives (N, 6, 7 + 6 G) of e by the scale, the camera's ξ, and the ξ of each place."""
-    predicted = predict(data, fit)
-    n, n_places = len(data), len(fit.Ts_anchor_board)
-    J = np.zeros((n, 6, 7 + 6 * n_places))
+def compute_jacobian(data: PoseData, fit: PoseFit) -> np.ndarray:
+    """Return the Jacobian (N, 6, 7 + 6 G) of e by the scale, the camera's ξ, and the ξ of each board pose."""
+    predicted = predict_board_poses(data, fit)
+    n, n_boards = len(data), len(fit.Ts_anchor_board)
+    J = np.zeros((n, 6, 7 + 6 * n_boards))
     J[:, :3, 0] = -data.Ts_camera_board[:, :3, 3]
     J[:, :3, 1:4] = J[:, 3:, 4:7] = -np.eye(3)
     J[:, :3, 4:7] = skew(predicted[:, :3, 3])
-    for i, place in enumerate(fit.place):
-        column = 7 + 6 * place
+    for i, board_index in enumerate(fit.board_index):
+        column = 7 + 6 * board_index
         J[i, :3, column : column + 3] = J[i, 3:, column + 3 : column + 6] = predicted[i, :3, :3]
     return J
 
 
-def arm_slopes(data: PoseData, fit: PoseFit) -> np.ndarray:
-    """Return how a small motion of the flange, in its own axes, changes e: (N, 6, 6), up to the sign."""
+def compute_arm_jacobian(data: PoseData, fit: PoseFit) -> np.ndarray:
+    """Return the Jacobian (N, 6, 6) of e by a small motion of the flange in its own axes, up to the sign."""
     R_camera_mount = fit.T_mount_camera[:3, :3].T
-    boards = fit.Ts_anchor_board[fit.place]
+    boards = fit.Ts_anchor_board[fit.board_index]
     if data.camera_on_flange:
         R = np.broadcast_to(R_camera_mount, (len(data), 3, 3))
         lever = (inverse(data.Ts_anchor_mount) @ boards)[:, :3, 3]
@@ -99,40 +100,40 @@ def arm_slopes(data: PoseData, fit: PoseFit) -> np.ndarray:
     return M
 
 
-def covariances(data: PoseData, fit: PoseFit, noise: NoiseLevels) -> np.ndarray:
+def compute_covariances(data: PoseData, fit: PoseFit, noise: NoiseLevels) -> np.ndarray:
     """Return the covariance (N, 6, 6) of each sample's e."""
-    M = arm_slopes(data, fit)
+    M = compute_arm_jacobian(data, fit)
     arm = np.repeat([noise.arm_m**2, noise.arm_rad**2], 3)
     return data.corner_covariances + (M * arm) @ np.swapaxes(M, 1, 2)
 
 
-def solve(
+def solve_least_squares(
     data: PoseData, fit: PoseFit, C: np.ndarray, weights: np.ndarray, *, free_scale: bool, rounds: int = 10
 ) -> tuple[PoseFit, np.ndarray]:
-    """Return the fit nearest to the samples, and the covariance of (scale, camera ξ, board ξ …).
+    """Return the weighted least-squares fit, and the covariance of (scale, camera ξ, board ξ …).
 
     Args:
         data: the samples.
-        fit: where to start.
+        fit: initial values.
         C: (N, 6, 6) covariances of e.
         weights: (N,) of the samples, 0 … 1.
-        free_scale: whether the squares' size is unknown; else its row and column of the covariance are 0.
-        rounds: of Gauss-Newton at most.
+        free_scale: whether the board's scale is estimated; else its row and column of the covariance are 0.
+        rounds: maximum of Gauss-Newton steps.
     """
     W = np.linalg.inv(C) * weights[:, None, None]
     P = np.zeros((0, 0))
     for _ in range(rounds):
-        e, J = errors(data, fit), slopes(data, fit)
+        e, J = compute_residuals(data, fit), compute_jacobian(data, fit)
         step, P = _step(e, J, W, fit, free_scale)
-        n_places = len(fit.Ts_anchor_board)
+        n_boards = len(fit.Ts_anchor_board)
         fit = replace(
             fit,
             scale=fit.scale + float(step[0]),
-            T_mount_camera=moved(fit.T_mount_camera, step[1:7]),
+            T_mount_camera=apply_increment(fit.T_mount_camera, step[1:7]),
             Ts_anchor_board=np.stack(
                 [
-                    moved(T, step[7 + 6 * g : 13 + 6 * g])
-                    for g, T in zip(range(n_places), fit.Ts_anchor_board, strict=True)
+                    apply_increment(T, step[7 + 6 * g : 13 + 6 * g])
+                    for g, T in zip(range(n_boards), fit.Ts_anchor_board, strict=True)
                 ]
             ),
         )
@@ -147,30 +148,30 @@ def _step(e: np.ndarray, J: np.ndarray, W: np.ndarray, fit: PoseFit, free_scale:
     g[0] += (fit.scale - 1.0) * _SCALE_SD**-2
     used = np.arange(0 if free_scale else 1, len(g))
     P = np.zeros_like(H)
-    # a group of samples that all got the weight 0 leaves its board free: it stays where it is
+    # The pseudo-inverse keeps a board pose where it is when all samples of its group have the weight 0
     P[np.ix_(used, used)] = np.linalg.pinv(H[np.ix_(used, used)], rcond=1e-15, hermitian=True)
     return -P @ g, P
 
 
 def _normal_equations(e: np.ndarray, J: np.ndarray, W: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    weighed, rows = (W @ J).reshape(-1, J.shape[2]), J.reshape(-1, J.shape[2])
-    return rows.T @ weighed, weighed.T @ e.ravel()
+    weighted, rows = (W @ J).reshape(-1, J.shape[2]), J.reshape(-1, J.shape[2])
+    return rows.T @ weighted, weighted.T @ e.ravel()
 
 
-def squared_distances(e: np.ndarray, C: np.ndarray) -> np.ndarray:
-    """Return the squared Mahalanobis distances (N,) of errors e (N, 6)."""
+def compute_squared_distances(e: np.ndarray, C: np.ndarray) -> np.ndarray:
+    """Return the squared Mahalanobis distances (N,) of residuals e (N, 6)."""
     return np.einsum("ni,ni->n", e, np.linalg.solve(C, e[..., None])[..., 0])
 
 
 def estimate_noise(
     data: PoseData, fit: PoseFit, kept: np.ndarray, start: NoiseLevels, *, free_scale: bool
 ) -> NoiseLevels:
-    """Return the scatter of the arm that makes the errors of the samples `kept` (N,) bool most likely.
+    """Return the scatter of the arm most likely to cause the residuals of the samples `kept` (N,) bool.
 
-    Restricted maximum likelihood: that the fit has swallowed part of the errors is reckoned with.
+    Restricted maximum likelihood (REML), which accounts for the part of the residuals that the fit absorbs.
     """
-    e, J = errors(data, fit)[kept], slopes(data, fit)[kept]
-    M, corner = arm_slopes(data, fit)[kept], data.corner_covariances[kept]
+    e, J = compute_residuals(data, fit)[kept], compute_jacobian(data, fit)[kept]
+    M, corner = compute_arm_jacobian(data, fit)[kept], data.corner_covariances[kept]
     J = J[:, :, 0 if free_scale else 1 :]
 
     def deviance(log_scatter: np.ndarray) -> float:
@@ -185,18 +186,18 @@ def estimate_noise(
         deviance,
         np.log([start.arm_m, start.arm_rad]),
         method="Nelder-Mead",
-        bounds=[(np.log(_MIN_SCATTER), np.log(0.3))] * 2,
+        bounds=[(np.log(_MIN_SCATTER), np.log(_MAX_SCATTER))] * 2,
         options={"xatol": 0.02, "fatol": 0.01, "maxfev": 120},
     )
     arm_m, arm_rad = np.exp(best.x)
     return NoiseLevels(arm_m=float(arm_m), arm_rad=float(arm_rad))
 
 
-def leave_one_out(
+def compute_leave_one_out(
     data: PoseData, fit: PoseFit, C: np.ndarray, kept: np.ndarray, *, free_scale: bool
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return each sample's error (N, 6) under the solution of all other samples kept, and its covariance (N, 6, 6)."""
-    e, J, W = errors(data, fit), slopes(data, fit), np.linalg.inv(C)
+    """Return each sample's residual (N, 6) under the solution of the others kept, and its covariance (N, 6, 6)."""
+    e, J, W = compute_residuals(data, fit), compute_jacobian(data, fit), np.linalg.inv(C)
     e_out, C_out = np.empty_like(e), np.empty_like(C)
     for i in range(len(data)):
         others = kept.copy()

@@ -1,4 +1,4 @@
-"""What a hand-eye calibration finds, and how far to trust it."""
+"""Result of a hand-eye calibration, with its residuals and its uncertainty."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ Setup = Literal["eye_in_hand", "eye_to_hand"]
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MethodResult:
-    """What one closed-form method says."""
+    """Result of one closed-form method."""
 
     name: str
     """tsai, park, horaud, andreff, daniilidis; shah, li (robot-world/hand-eye)."""
     T_mount_camera: np.ndarray
-    """(4, 4) its camera pose."""
+    """(4, 4) camera pose."""
     T_anchor_board: np.ndarray
-    """(4, 4) the mean of where the samples then see the board."""
+    """(4, 4) mean of the board poses over the samples."""
     rms_mm: float
     """Spread of the board's position over all samples [mm]."""
     rms_deg: float
@@ -31,10 +31,10 @@ class MethodResult:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class HandEyeResult:
-    """The camera's pose, and how far to trust it."""
+    """The camera's pose, its uncertainty, and the residuals of the samples."""
 
     setup: Setup
-    """Which of the two problems was solved."""
+    """The problem that was solved."""
     T_mount_camera: np.ndarray
     """(4, 4) the camera on the flange (eye in hand) or in the base (eye to hand)."""
     T_anchor_board: np.ndarray
@@ -43,15 +43,15 @@ class HandEyeResult:
     """(6, 6) of ξ = (ρ [m], ω [rad]) in camera axes: the true camera has the position p + R ρ and the rotation
     R Exp(ω), where p and R are those of `T_mount_camera`."""
     uncertainty_mm: float
-    """The camera's true position is nearer than this with probability `uncertainty.COVERAGE` [mm]."""
+    """Radius around the position that holds the true one with probability `uncertainty.COVERAGE` [mm]."""
     uncertainty_deg: float
-    """The camera's true orientation is nearer than this with probability `uncertainty.COVERAGE` [°]."""
+    """Angle from the orientation within which the true one is with probability `uncertainty.COVERAGE` [°]."""
     methods: tuple[MethodResult, ...]
     """The closed forms, best first."""
     sample_names: tuple[str, ...]
     """(N,) names of all samples given."""
     residuals_mm: np.ndarray
-    """(N,) how far each sample sees the board from `T_anchor_board`, dropped ones included [mm]."""
+    """(N,) distance of each sample's board from `T_anchor_board`, dropped ones included [mm]."""
     residuals_deg: np.ndarray
     """(N,) the same in orientation [°]."""
     residuals_px: np.ndarray | None
@@ -69,11 +69,11 @@ class HandEyeResult:
     holdout_deg: float
     """The same in orientation [°]."""
     diversity: float
-    """Spread of the rotations, 0 (nothing can be said) … 1 (as good as it gets)."""
+    """Score of the rotations, 0 (undetermined) … 1 (good), by `diversity.compute_diversity`."""
     square_m: float | None
     """The edge of a square as the arm's motions measure it; None without `refine` [m]."""
     noise: NoiseLevels
-    """The scatter of the arm that the samples show; without `refine` that of the board's poses too."""
+    """Scatter of the arm, estimated from the samples; without `refine` including that of the board's poses."""
     dropped: dict[str, str]
     """Samples left out by name, with the reason."""
     warnings: tuple[CalibrationWarning, ...]
@@ -84,30 +84,30 @@ class HandEyeResult:
         """(4, 4) the camera on the flange.
 
         Raises:
-            CalibrationError: this is an eye to hand.
+            CalibrationError: `wrong_setup`: an eye-to-hand result.
         """
-        return self._of("eye_in_hand", self.T_mount_camera)
+        return self._pose_of("eye_in_hand", self.T_mount_camera)
 
     @property
     def T_base_board(self) -> np.ndarray:
         """(4, 4) the board in the base; raises as `T_flange_camera` does."""
-        return self._of("eye_in_hand", self.T_anchor_board)
+        return self._pose_of("eye_in_hand", self.T_anchor_board)
 
     @property
     def T_base_camera(self) -> np.ndarray:
         """(4, 4) the camera in the base.
 
         Raises:
-            CalibrationError: this is an eye in hand.
+            CalibrationError: `wrong_setup`: an eye-in-hand result.
         """
-        return self._of("eye_to_hand", self.T_mount_camera)
+        return self._pose_of("eye_to_hand", self.T_mount_camera)
 
     @property
     def T_flange_board(self) -> np.ndarray:
         """(4, 4) the board on the flange; raises as `T_base_camera` does."""
-        return self._of("eye_to_hand", self.T_anchor_board)
+        return self._pose_of("eye_to_hand", self.T_anchor_board)
 
-    def _of(self, setup: Setup, T: np.ndarray) -> np.ndarray:
+    def _pose_of(self, setup: Setup, T: np.ndarray) -> np.ndarray:
         if self.setup != setup:
-            raise CalibrationError("wrong_setup", f"this calibration is of an {self.setup}, not of an {setup}.")
+            raise CalibrationError(f"hand-eye result: wrong setup ({self.setup}, needed {setup}).", code="wrong_setup")
         return T

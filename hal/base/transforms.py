@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pinocchio as pin  # pyright: ignore[reportMissingImports] - a .pth file leads to it
+from scipy.spatial.transform import Rotation
 
 from hal.base.errors import InvalidValueError
 
@@ -84,3 +85,36 @@ def interpolate(T_base_a: np.ndarray, T_base_b: np.ndarray, s: np.ndarray) -> np
     Ts[:, :3, 3] = T_base_a[:3, 3] + s[:, None] * step[:3]
     Ts[:, 3, 3] = 1.0
     return Ts
+
+
+def skew(v: np.ndarray) -> np.ndarray:
+    """Return K (..., 3, 3) of vectors (..., 3), with K @ x = v × x."""
+    K = np.zeros((*v.shape, 3))
+    K[..., 2, 1], K[..., 0, 2], K[..., 1, 0] = v[..., 0], v[..., 1], v[..., 2]
+    return K - np.swapaxes(K, -1, -2)
+
+
+def rotation_vectors(R: np.ndarray) -> np.ndarray:
+    """Return the rotation vectors (..., 3) [rad] of matrices (..., 3, 3)."""
+    return Rotation.from_matrix(R).as_rotvec()
+
+
+def apply_increment(T_parent_child: np.ndarray, increment: np.ndarray) -> np.ndarray:
+    """Return poses (..., 4, 4) changed by increments ξ = (ρ [m], ω [rad]) (..., 6) in the child's axes.
+
+    The position becomes p + R ρ and the rotation R Exp(ω): translation and rotation stay decoupled, unlike in the
+    exponential map of SE(3).
+    """
+    R = T_parent_child[..., :3, :3]
+    T = T_parent_child.copy()
+    T[..., :3, 3] += (R @ increment[..., :3, None])[..., 0]
+    # Rotation and not RigidTransform, which takes ten times as long for one pose and is called in inner loops
+    T[..., :3, :3] = R @ Rotation.from_rotvec(increment[..., 3:]).as_matrix()
+    return T
+
+
+def pose_distances(Ts_parent_a: np.ndarray, Ts_parent_b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the distances (...) [m] and the angles (...) [rad] between poses (..., 4, 4), which may broadcast."""
+    R_a_b = np.swapaxes(Ts_parent_a[..., :3, :3], -1, -2) @ Ts_parent_b[..., :3, :3]
+    distances_m = np.linalg.norm(Ts_parent_a[..., :3, 3] - Ts_parent_b[..., :3, 3], axis=-1)
+    return distances_m, np.linalg.norm(rotation_vectors(R_a_b), axis=-1)

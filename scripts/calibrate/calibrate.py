@@ -1,10 +1,10 @@
-"""Calibrate the wrist camera with a printed ChArUco board, and test the result.
+"""Calibrate the wrist camera with a printed ChArUco board, and check the result.
 
-./z1 calibrate board         a page to print
-./z1 calibrate hand-eye      where the camera sits on the flange, with the error in millimetres
-./z1 calibrate verify        point at corners of the board and measure by how much it is missed
-./z1 calibrate intrinsics    camera matrix and distortion
-./z1 calibrate capture       pictures only, to solve later
+./z1 calibrate board         write the board as a page to print
+./z1 calibrate hand-eye      estimate the camera's pose on the flange, with its uncertainty
+./z1 calibrate verify        move the tip over corners of the board and measure the offsets
+./z1 calibrate intrinsics    estimate camera matrix and distortion
+./z1 calibrate capture       capture samples only, to solve later
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ Config = (
     | Annotated[calibrate_hand_eye.Config, _step("hand-eye", calibrate_hand_eye)]
     | Annotated[verify_hand_eye.Config, _step("verify", verify_hand_eye)]
 )
-"""Which step, with its options."""
+"""Options of one step."""
 
 
 def main(config: object) -> int:
-    """Do the step that `config` belongs to."""
+    """Run the step of `config`."""
     (step,) = (step for step in _STEPS if isinstance(config, step.Config))
-    return step.main(config)  # pyright: ignore[reportArgumentType] (it is this step's)
+    return step.main(config)  # pyright: ignore[reportArgumentType] - the type was matched above

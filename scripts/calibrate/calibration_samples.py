@@ -1,4 +1,4 @@
-"""What every solver starts from: the samples of a folder, with the board found in each."""
+"""Samples of a folder with the board detected in each: the input of every solver."""
 
 from __future__ import annotations
 
@@ -15,51 +15,51 @@ from calibration.errors import CalibrationError, CalibrationWarning
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from calibration.samples import Sample, Session
+    from calibration.samples import CaptureInfo, Sample
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class SeenSamples:
-    """Samples that show the board."""
+class DetectedSamples:
+    """Samples with a detected board."""
 
-    session: Session
-    """What they have in common."""
+    info: CaptureInfo
+    """Common properties."""
     names: list[str]
     """(N,)."""
     samples: list[Sample]
     """(N,)."""
     views: list[BoardView]
-    """(N,) the corners in each."""
+    """(N,) detected corners."""
 
 
-def read_samples(folder: Path, console: Console) -> SeenSamples:
-    """Return the samples of `folder` in which the board is found; the others are told on the console.
+def read_samples(folder: Path, console: Console) -> DetectedSamples:
+    """Return the samples of `folder` with a detected board; print the others with their reason.
 
     Raises:
-        CalibrationError: `folder` holds no session.
+        CalibrationError: `no_session`.
     """
     from calibration.samples import load_samples
 
     loaded = load_samples(folder)
     show_warnings(loaded.warnings, console)
-    seen = SeenSamples(session=loaded.session, names=[], samples=[], views=[])
+    detected = DetectedSamples(info=loaded.info, names=[], samples=[], views=[])
     for name, sample in zip(loaded.names, loaded.samples, strict=True):
         try:
-            view = detect_board(sample.image, loaded.session.board)
+            view = detect_board(sample.image, loaded.info.board)
         except CalibrationError as error:
             console.print(f"[yellow]sample {name} is left out:[/] {error}", soft_wrap=True)
             continue
-        seen.names.append(name)
-        seen.samples.append(sample)
-        seen.views.append(view)
-    return seen
+        detected.names.append(name)
+        detected.samples.append(sample)
+        detected.views.append(view)
+    return detected
 
 
 def show_warnings(warnings: Sequence[CalibrationWarning], console: Console) -> None:
-    """Print each warning as a line."""
+    """Print one line for each warning."""
     for warning in warnings:
-        whose = f" ({', '.join(warning.samples)})" if warning.samples else ""
-        console.print(f"[yellow]{warning.code}{whose}:[/] {warning}", soft_wrap=True)
+        names = f" ({', '.join(warning.samples)})" if warning.samples else ""
+        console.print(f"[yellow]{warning.code}{names}:[/] {warning}", soft_wrap=True)
 
 
 def now() -> str:

@@ -1,9 +1,9 @@
-"""Take pictures of the calibration board from many sides; each is on disk as it is taken.
+"""Capture images of the calibration board from many sides; each is saved at once.
 
 ./z1 calibrate capture                          the twin
-./z1 calibrate capture --hal real               the arm whose HAL runs; lay the board 0.4 m in front of it first
-./z1 calibrate capture --hal real --hand-guided the same while a hand guides the arm; Enter takes a picture, q ends
-./z1 calibrate capture --out DIR                goes on where an interrupted capture stopped
+./z1 calibrate capture --hal real               the arm of a running HAL; place the board 0.4 m in front of it
+./z1 calibrate capture --hal real --hand-guided the same with the arm guided by hand; Enter captures, q ends
+./z1 calibrate capture --out DIR                continue an interrupted capture
 """
 
 from __future__ import annotations
@@ -28,33 +28,33 @@ from scripts.support.calibration_robot import RobotOptions, open_robot
 
 if TYPE_CHECKING:
     from sim_twin.ground_truth import GroundTruth
-    from z1_runtime.calibration_session.capture import Capture, Key, Taken
+    from z1_runtime.calibration_session.capture import CapturedView, Key, SampleCapture
 
 
 @dataclass(frozen=True, kw_only=True)
 class Config:
-    """Which robot and board, and how many pictures."""
+    """Robot, board and number of samples."""
 
     out: Path | None = None
-    """Folder of the samples; by default a new one beside the results. One that holds samples is completed."""
+    """Folder of the samples; by default a new one in the folder of results. A folder with samples is completed."""
     poses: int = 20
-    """How many pictures."""
+    """Number of samples."""
     hand_guided: bool = False
-    """Do not move the arm: take a picture when Enter is pressed, or a new view is held still."""
+    """Do not move the arm: capture when Enter is pressed, or when the arm rests at a new view."""
     speed: float = 0.5
     """Fraction of the arm's limits that motions use."""
     seed: int = 0
-    """Of the views, and of the twin's noise."""
+    """Seed of the views, and of the twin's noise."""
     view: bool = False
-    """Show everything live in Rerun."""
+    """Show the capture live in Rerun."""
     board: Annotated[Board, tyro.conf.arg(name="")] = field(default_factory=Board)
-    """The board that lies there."""
+    """The board on the table."""
     robot: Annotated[RobotOptions, tyro.conf.arg(name="")] = field(default_factory=RobotOptions)
-    """Which robot."""
+    """The robot."""
 
 
 def main(config: Config) -> int:
-    """Capture; 0 when there are as many pictures as wanted."""
+    """Capture; return 0 with the wanted number of samples."""
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
     console = Console(highlight=False)
     folder, n = capture(config, console)
@@ -62,21 +62,21 @@ def main(config: Config) -> int:
     return 0 if n >= config.poses else 1
 
 
-def capture(config: Config, console: Console, pressed: Callable[[], Key] | None = None) -> tuple[Path, int]:
+def capture(config: Config, console: Console, read_key: Callable[[], Key] | None = None) -> tuple[Path, int]:
     """Fill a folder with samples and return it with their number.
 
     Args:
-        config: how.
-        console: where progress is told.
-        pressed: asked for the operator's key while a hand guides the arm; by default the terminal is.
+        config: options of the capture.
+        console: for the progress.
+        read_key: returns the operator's key while the arm is guided by hand; by default from the terminal.
     """
     from z1_runtime.calibration_session.board_search import BoardSearch
-    from z1_runtime.calibration_session.capture import Capture
+    from z1_runtime.calibration_session.capture import SampleCapture
     from z1_runtime.visualization.rerun_logger import RerunLogger
 
     if config.poses < 1 or not 0.0 < config.speed <= 1.0:
         raise InvalidValueError(
-            f"poses is {config.poses}, speed is {config.speed}; allowed are 1 and more, above 0 up to 1."
+            f"capture: out of range (poses {config.poses}, speed {config.speed}; allowed from 1, above 0 to 1)."
         )
     folder = config.out or new_folder()
     with ExitStack() as undo:
@@ -84,77 +84,77 @@ def capture(config: Config, console: Console, pressed: Callable[[], Key] | None 
         undo.callback(inspector.close)
         robot = undo.enter_context(open_robot(config.robot, config.board, config.seed))
         devices = {"arm": robot.arm, "camera": robot.camera, "clock": robot.clock, "board": config.board}
-        session = Capture(**devices, folder=folder, inspector=inspector)
-        n_before = session.open(now(), twin_truth(robot.truth))
+        session = SampleCapture(**devices, folder=folder, inspector=inspector)
+        n_before = session.open(now(), twin_ground_truth(robot.truth))
         console.print(
             f"samples go to {folder}" + (f", which has {n_before} already" if n_before else ""), soft_wrap=True
         )
         if config.hand_guided:
-            console.print("guide the arm by hand: hold still for a picture, Enter takes one at once, q Enter ends")
-            pictures = session.follow_hand(pressed or terminal_key, config.poses)
+            console.print("guide the arm by hand: rest for a sample, Enter captures one at once, q Enter ends")
+            views = session.capture_hand_guided(read_key or read_terminal_key, config.poses)
         else:
             robot.arm.claim("calibrate")
             search = BoardSearch(**devices, speed=config.speed)
             search.executor.watchers.append(inspector.log_arm)
-            pictures = session.drive(search, config.poses, config.seed)
+            views = session.capture_automatically(search, config.poses, config.seed)
         try:
-            _tell(session, pictures, config.poses, console)
+            _report_progress(session, views, config.poses, console)
         except KeyboardInterrupt:
-            n = len(session.taken)
+            n = len(session.captured)
             console.print(
                 f"{n} of {config.poses} samples are kept; `--out {folder}` goes on from there", soft_wrap=True
             )
             raise
-    return folder, len(session.taken)
+    return folder, len(session.captured)
 
 
-def capture_beside(calibrations: Path | None, config: Config, console: Console) -> Path:
-    """As `capture`, into a folder beside the results in `calibrations` unless `config` names one."""
+def capture_next_to_results(calibrations: Path | None, config: Config, console: Console) -> Path:
+    """Capture as `capture` does, into a new folder of the results in `calibrations` unless `config` names one."""
     return capture(replace(config, out=config.out or new_folder(calibrations)), console)[0]
 
 
 def new_folder(calibrations: Path | None = None) -> Path:
-    """Return a folder for samples beside the results in `calibrations` that does not exist yet."""
+    """Return a new folder for samples in the folder of results `calibrations`."""
     from z1_runtime.perception.extrinsics import results_folder
 
     return results_folder(calibrations) / "samples" / datetime.now().strftime("%Y-%m-%dT%H-%M-%S")
 
 
-def terminal_key() -> Key:
-    """Return what was typed since the last call, without waiting."""
+def read_terminal_key() -> Key:
+    """Return the key typed since the last call, without waiting."""
     if not select.select([sys.stdin], [], [], 0.0)[0]:
         return ""
     line = sys.stdin.readline()
     return "end" if not line or line.strip().lower().startswith("q") else "take"
 
 
-def twin_truth(truth: Callable[[], GroundTruth] | None) -> dict | None:
-    """Return what a session keeps of the twin's truth; None where nobody knows it."""
-    if truth is None:
+def twin_ground_truth(ground_truth: Callable[[], GroundTruth] | None) -> dict | None:
+    """Return the twin's poses as saved with the samples; None for a real arm."""
+    if ground_truth is None:
         return None
-    poses = truth()
+    poses = ground_truth()
     assert poses.T_base_board is not None
     return {"T_mount_camera": poses.T_flange_camera.tolist(), "T_anchor_board": poses.T_base_board.tolist()}
 
 
-def _tell(session: Capture, pictures: Iterator[Taken], wanted: int, console: Console) -> None:
+def _report_progress(session: SampleCapture, views: Iterator[CapturedView], n_samples: int, console: Console) -> None:
     from z1_runtime.calibration_session.coverage import Coverage
 
-    coverage = Coverage.of(session.taken)
+    coverage = Coverage.of(session.captured)
     try:
-        for taken in pictures:
-            if taken.view is None:
-                console.print(f"  {'–':>9}  {taken.problem}", soft_wrap=True)
+        for captured in views:
+            if captured.view is None:
+                console.print(f"  {'–':>9}  {captured.message}", soft_wrap=True)
                 continue
-            coverage = Coverage.of(session.taken)
-            doubt = f"  {taken.problem}" if taken.problem else ""
+            coverage = Coverage.of(session.captured)
+            warning = f"  {captured.message}" if captured.message else ""
             console.print(
-                f"  {len(session.taken):>3} of {wanted:<3} {taken.name}  {len(taken.view.ids):>3} corners; so far "
-                f"{coverage.summary()}{doubt}",
+                f"  {len(session.captured):>3} of {n_samples:<3} {captured.name}  {len(captured.view.ids):>3} corners; "
+                f"so far {coverage.summary()}{warning}",
                 soft_wrap=True,
             )
     finally:  # also after Ctrl-C
-        console.print(coverage.picture())
+        console.print(coverage.draw_map())
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Write the calibration board as a page to print at 100 %, with a ruler to check the print by.
+"""Write the calibration board as a page to print at 100 %, with a ruler to check the print.
 
 ./z1 calibrate board
 ./z1 calibrate board --columns 7 --rows 5 --square-m 0.03 --marker-m 0.022 --out board.png
@@ -19,12 +19,12 @@ from calibration.board.sheet import save_sheet
 
 @dataclass(frozen=True, kw_only=True)
 class Config:
-    """Which board, on which paper."""
+    """Board and paper."""
 
     out: Path = Path("out/board.pdf")
-    """A .pdf or .png."""
+    """Page to write, .pdf or .png."""
     paper: Literal["A4", "Letter", "A3"] = "A4"
-    """Of the printer."""
+    """Paper of the printer."""
     board: Annotated[Board, tyro.conf.arg(name="")] = field(default_factory=Board)
     """The board."""
 
@@ -34,8 +34,9 @@ def main(config: Config) -> int:
     config.out.parent.mkdir(parents=True, exist_ok=True)
     save_sheet(config.board, config.out, paper=config.paper)
     Console(highlight=False).print(
-        f"{config.out}: print it at 100 %, check its ruler with your own, and glue it to something flat. If the ruler "
-        "is off, measure a square and give the true --square-m and --marker-m to the other commands.",
+        f"{config.out}: print it at 100 %, check its ruler, and glue it to a flat plate. If the ruler is wrong, "
+        "measure "
+        "a square and pass the true --square-m and --marker-m to the other commands.",
         soft_wrap=True,
     )
     return 0

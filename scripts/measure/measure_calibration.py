@@ -23,13 +23,13 @@ from hal.base import z1
 from hal.base.transforms import pose_error
 from scripts.calibrate import capture_charuco
 from scripts.calibrate.calibrate_hand_eye import solve
-from scripts.calibrate.calibration_samples import SeenSamples, now, read_samples
+from scripts.calibrate.calibration_samples import DetectedSamples, now, read_samples
 from scripts.commands import run_demo
 from scripts.support.calibration_robot import RobotOptions, make_scene
 from sim_twin.backends import make_rig
 from sim_twin.ground_truth import read_ground_truth
 from z1_runtime.calibration_session.board_search import BoardSearch
-from z1_runtime.calibration_session.capture import Capture
+from z1_runtime.calibration_session.capture import SampleCapture
 
 if TYPE_CHECKING:
     from calibration.hand_eye.solver import HandEyeResult
@@ -86,11 +86,11 @@ def _run(config: Config, seed: int, console: Console) -> dict[str, float]:
         observed = _capture(config, seed, Path(folder) / "samples")
         if config.joint_noise_rad:
             _blur_joints(observed, config.joint_noise_rad, seed)
-        result = solve(observed, observed.session.camera)
+        result = solve(observed, observed.info.camera)
     if seed == 0 and config.corrupted:
         _corrupt(observed, config.corrupted, console)
-    assert observed.session.truth is not None
-    error_m, error_rad = pose_error(np.array(observed.session.truth["T_mount_camera"]), result.T_mount_camera)
+    assert observed.info.ground_truth is not None
+    error_m, error_rad = pose_error(np.array(observed.info.ground_truth["T_mount_camera"]), result.T_mount_camera)
     row = {
         "seed": seed,
         "samples": len(observed.names),
@@ -110,7 +110,7 @@ def _run(config: Config, seed: int, console: Console) -> dict[str, float]:
     return row
 
 
-def _capture(config: Config, seed: int, folder: Path) -> SeenSamples:
+def _capture(config: Config, seed: int, folder: Path) -> DetectedSamples:
     rng = np.random.default_rng(seed)
     robot = RobotOptions(
         board_x_m=float(rng.uniform(0.36, 0.46)),
@@ -135,7 +135,7 @@ class _JumpingSearch(BoardSearch):
         super().__init__(**devices)
         self._world = world
 
-    def go(self, q: np.ndarray, checker: CollisionChecker) -> bool:
+    def move_to(self, q: np.ndarray, checker: CollisionChecker) -> bool:
         self._world.data.qpos[: z1.N_JOINTS], self._world.data.qvel[: z1.N_JOINTS] = q, 0.0
         self._world.set_command(q, np.zeros(z1.N_JOINTS))
         self._clock.sleep_until(self._clock.now_s() + self._rest_s)
@@ -150,14 +150,14 @@ def _capture_by_jumps(scene: SceneConfig, poses: int, folder: Path) -> None:
     rig.arm.connect()
     rig.camera.connect()
     devices: dict[str, Any] = {"arm": rig.arm, "camera": rig.camera, "clock": rig.clock, "board": Board()}
-    capture = Capture(**devices, folder=folder)
-    capture.open(now(), capture_charuco.twin_truth(lambda: read_ground_truth(rig.world)))
-    for _ in capture.drive(_JumpingSearch(rig.world, **devices, rest_s=0.1), poses, scene.seed):
+    capture = SampleCapture(**devices, folder=folder)
+    capture.open(now(), capture_charuco.twin_ground_truth(lambda: read_ground_truth(rig.world)))
+    for _ in capture.capture_automatically(_JumpingSearch(rig.world, **devices, rest_s=0.1), poses, scene.seed):
         pass
     rig.camera.disconnect()
 
 
-def _blur_joints(observed: SeenSamples, sd_rad: float, seed: int) -> None:
+def _blur_joints(observed: DetectedSamples, sd_rad: float, seed: int) -> None:
     """Recompute the arm pose of each sample from joints with a measurement error."""
     from z1_runtime.geometry.kinematics import Kinematics
 
@@ -167,7 +167,7 @@ def _blur_joints(observed: SeenSamples, sd_rad: float, seed: int) -> None:
         observed.samples[number] = replace(sample, T_base_flange=kinematics.flange(q))
 
 
-def _corrupt(observed: SeenSamples, n: int, console: Console) -> None:
+def _corrupt(observed: DetectedSamples, n: int, console: Console) -> None:
     """Print whether `n` samples whose arm pose is falsified by 10 mm are dropped."""
     samples = list(observed.samples)
     wrong = np.random.default_rng(0).choice(len(samples), n, replace=False)
@@ -175,9 +175,9 @@ def _corrupt(observed: SeenSamples, n: int, console: Console) -> None:
         T = samples[number].T_base_flange.copy()
         T[:3, 3] += [0.006, -0.008, 0.0]
         samples[number] = replace(samples[number], T_base_flange=T)
-    result = solve(replace(observed, samples=samples), observed.session.camera)
-    assert observed.session.truth is not None
-    error_m, error_rad = pose_error(np.array(observed.session.truth["T_mount_camera"]), result.T_mount_camera)
+    result = solve(replace(observed, samples=samples), observed.info.camera)
+    assert observed.info.ground_truth is not None
+    error_m, error_rad = pose_error(np.array(observed.info.ground_truth["T_mount_camera"]), result.T_mount_camera)
     falsified = {observed.names[number] for number in wrong}
     verdict = "all dropped, no other" if falsified == set(result.dropped) else "[red]not the same[/]"
     dropped = ", ".join(sorted(result.dropped)) or "none"
@@ -229,20 +229,20 @@ def _demos(config: Config, console: Console) -> None:
 
 def _mounts(config: Config, folder: Path) -> dict[str, Path]:
     """Return a result file for the drawing's extrinsics, the ones calibrated with seed 0, and the true ones."""
-    from calibration.results import Calibration, save_result
+    from calibration.results import CalibrationResult, save_result
 
     observed = _capture(config, 0, folder / "samples")
-    result = solve(observed, observed.session.camera)
-    session, ground_truth = observed.session, observed.session.truth
+    result = solve(observed, observed.info.camera)
+    info, ground_truth = observed.info, observed.info.ground_truth
     assert ground_truth is not None
 
     def save(T_mount_camera: np.ndarray, base: HandEyeResult) -> Path:
-        calibration = Calibration.of_hand_eye(
+        calibration = CalibrationResult.of_hand_eye(
             replace(base, T_mount_camera=T_mount_camera),
-            serial=session.serial,
+            serial=info.serial,
             date=now(),
             board=Board(),
-            camera=session.camera,
+            camera=info.camera,
             folder=str(folder),
         )
         return save_result(folder, calibration)

@@ -1,4 +1,4 @@
-"""Finds the board on the table with the wrist camera, and drives among the views of it."""
+"""Search for the board on the table with the wrist camera, and motions between views of it."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from z1_runtime.calibration_session.viewpoints import (
     Viewpoint,
     ViewpointConfig,
     find_viewpoints,
-    look_around,
-    plan_way,
-    table_only,
+    make_table_checker,
+    plan_free_motion,
+    scan_scene,
 )
 from z1_runtime.collision.scene_collision import CollisionChecker
 from z1_runtime.geometry.kinematics import Kinematics
@@ -31,38 +31,38 @@ from z1_runtime.motion.executor import Executor, MotionError
 from z1_runtime.motion.trajectory import MotionLimits
 
 STILL_RAD = 1e-3
-"""An arm whose joints change less than this while a picture is taken stands still [rad]."""
+"""Maximum change of the joints during an exposure for the arm to count as still [rad]."""
 
-_TRIES = 5
+_MAX_FRAMES = 5  # frames tried until the arm is still
 _FROM_ABOVE = make_pose(np.array([[0.0, -1, 0], [-1, 0, 0], [0, 0, -1]]), np.array([0.36, 0.0, 0.38]))
-"""T_base_camera that sees what lies too near to be seen from home."""
+"""T_base_camera with a view of the area near the base, which is out of view from home."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class FoundBoard:
-    """The board as the camera has seen it once."""
+class LocatedBoard:
+    """The board's pose from one frame, with the obstacles around it."""
 
     T_base_board: np.ndarray
-    """(4, 4) where it lies, by the mount assumed."""
+    """(4, 4), by the assumed extrinsics."""
     checker: CollisionChecker
-    """What else was seen, to keep away from."""
+    """Collision checker for the table and the obstacles in view."""
     intrinsics: Intrinsics
-    """Of the camera."""
+    """Intrinsics of the camera."""
 
 
 class BoardSearch:
-    """Drives the arm to where the board is seen; its lease is held.
+    """Search motions of an arm, whose lease must be held, for views of the board.
 
     Args:
         arm: connected.
         camera: the wrist camera, connected.
-        clock: the one both live by.
-        board: to be found.
-        T_flange_camera: (4, 4) the mount as far as it is known.
-        views: from where a board may be looked at.
+        clock: of both devices.
+        board: the board to find.
+        T_flange_camera: (4, 4) assumed extrinsics.
+        views: constraints on the views.
         speed: fraction of the arm's limits that motions use, in (0, 1].
-        rest_s: how long the arm stands before a picture is taken [s].
-        frame_timeout_s: how long to wait for a camera frame [s].
+        rest_s: duration of rest before a frame [s].
+        frame_timeout_s: maximum duration until a camera frame [s].
     """
 
     def __init__(
@@ -87,46 +87,50 @@ class BoardSearch:
         self._limits = MotionLimits.at_speed(speed)
         self._rest_s, self._frame_timeout_s = rest_s, frame_timeout_s
 
-    def find(self) -> FoundBoard:
-        """Look from home and, if the board is not seen from there, from above what lies near the arm.
+    def find(self) -> LocatedBoard:
+        """Locate the board from home or, when it is not in view there, from above the area near the base.
 
         Raises:
-            CalibrationError: the board is not seen.
-            NoTableError: nor is the table.
-            MotionError, HalError: there is no free way, or the arm does not follow.
+            CalibrationError: the board is not detected.
+            NoTableError: the table is not in view.
+            MotionError, HalError: no collision-free motion, or the arm does not follow.
         """
-        frame, q = self.still_frame()
-        if not self.go(self._home(), table_only(self.kinematics, frame, q)):
-            raise MotionError("there is no free way home from here; move the arm up by hand, then try again.")
-        frame, q = self.still_frame()
-        checker = look_around(self.kinematics, frame, q, self._T_flange_camera)
+        frame, q = self.capture_still_frame()
+        if not self.move_to(self._home(), make_table_checker(self.kinematics, frame, q)):
+            raise MotionError(
+                "board search: no collision-free motion home from here. Move the arm up by hand, then try again."
+            )
+        frame, q = self.capture_still_frame()
+        checker = scan_scene(self.kinematics, frame, q, self._T_flange_camera)
         try:
             T_base_board = self._board_in_base(frame, q)
         except CalibrationError as error:
             if error.code == "wrong_board":
                 raise
             above = self.kinematics.best(_FROM_ABOVE @ inverse(self._T_flange_camera) @ z1.T_FLANGE_PIVOT)
-            if self.go(np.append(above.q, self.views.jaw), checker):
-                frame, q = self.still_frame()
+            if self.move_to(np.append(above.q, self.views.jaw), checker):
+                frame, q = self.capture_still_frame()
             T_base_board = self._board_in_base(frame, q)
-        return FoundBoard(T_base_board=T_base_board, checker=checker, intrinsics=frame.intrinsics)
+        return LocatedBoard(T_base_board=T_base_board, checker=checker, intrinsics=frame.intrinsics)
 
-    def look_closer(self, found: FoundBoard) -> FoundBoard:
-        """Look once more, from where most of the board is seen.
+    def refine(self, found: LocatedBoard) -> LocatedBoard:
+        """Locate the board again from the view with most of its corners.
 
         Raises:
-            As `find`; and NoViewpointsError: no such place is within reach.
+            As `find`; and NoViewpointsError: no such view is reachable.
         """
-        (view,) = self.choose(found, 1)
-        if not self.go(view.q, found.checker):
-            raise MotionError("there is no free way to where the board is seen best; clear the table around it.")
-        frame, q = self.still_frame()
+        (view,) = self.choose_viewpoints(found, 1)
+        if not self.move_to(view.q, found.checker):
+            raise MotionError(
+                "board search: no collision-free motion to the best view. Clear the table around the board."
+            )
+        frame, q = self.capture_still_frame()
         return replace(found, T_base_board=self._board_in_base(frame, q))
 
-    def choose(
-        self, found: FoundBoard, n: int, *, taken: list[np.ndarray] | None = None, seed: int = 0
+    def choose_viewpoints(
+        self, found: LocatedBoard, n: int, *, existing: list[np.ndarray] | None = None, seed: int = 0
     ) -> list[Viewpoint]:
-        """Return `n` views, far from each other and from those `taken` (see `find_viewpoints`)."""
+        """Return `n` views, far from each other and from the `existing` camera poses (see `find_viewpoints`)."""
         return find_viewpoints(
             self.kinematics,
             found.checker,
@@ -135,31 +139,31 @@ class BoardSearch:
             self._board.corners_m,
             q_start=self._q_command(),
             T_flange_camera=self._T_flange_camera,
-            taken=taken or [],
+            existing=existing or [],
             config=replace(self.views, n=n),
             seed=seed,
         )
 
-    def go(self, q: np.ndarray, checker: CollisionChecker) -> bool:
-        """Go to `q` (7,) and come to rest; False if there is no free way.
+    def move_to(self, q: np.ndarray, checker: CollisionChecker) -> bool:
+        """Move to `q` (7,) and come to rest; return False without a collision-free motion.
 
         Raises:
             MotionError, HalError: the arm does not follow, or is stopped.
         """
-        way = plan_way(checker, self._q_command(), q, self._limits)
-        if way is not None:
-            self.executor.execute(way)
+        motion = plan_free_motion(checker, self._q_command(), q, self._limits)
+        if motion is not None:
+            self.executor.execute(motion)
             self.executor.settle()
             self._clock.sleep_until(self._clock.now_s() + self._rest_s)
-        return way is not None
+        return motion is not None
 
-    def go_home(self, checker: CollisionChecker) -> bool:
-        """As `go`, to where the arm looks from."""
-        return self.go(self._home(), checker)
+    def move_home(self, checker: CollisionChecker) -> bool:
+        """Move home as `move_to` does."""
+        return self.move_to(self._home(), checker)
 
-    def still_frame(self) -> tuple[RgbdFrame, np.ndarray]:
-        """Return a frame and the joints (7,) at which it was taken (see the function of that name)."""
-        return still_frame(self._arm, self._camera, self._frame_timeout_s)
+    def capture_still_frame(self) -> tuple[RgbdFrame, np.ndarray]:
+        """Return a frame and the joints (7,) during it (see the function of the same name)."""
+        return capture_still_frame(self._arm, self._camera, self._frame_timeout_s)
 
     def _home(self) -> np.ndarray:
         return np.append(z1.Q_HOME, self.views.jaw)
@@ -173,16 +177,16 @@ class BoardSearch:
         return self.kinematics.flange(q[: z1.N_ARM]) @ self._T_flange_camera @ T_camera_board
 
 
-def still_frame(arm: Arm, camera: Camera, timeout_s: float) -> tuple[RgbdFrame, np.ndarray]:
-    """Return the next frame during which the arm stood still, and its joints (7,) then [rad].
+def capture_still_frame(arm: Arm, camera: Camera, timeout_s: float) -> tuple[RgbdFrame, np.ndarray]:
+    """Return the next frame with a still arm, and the joints (7,) during it [rad].
 
     Raises:
-        MotionError: it moves.
+        MotionError: the arm moves.
         HalTimeoutError: no frame within `timeout_s` [s].
     """
     before = arm.read_state().q
     moved = np.zeros(z1.N_JOINTS)
-    for _ in range(_TRIES):
+    for _ in range(_MAX_FRAMES):
         frame = camera.wait_for_frame(timeout_s)
         after = arm.read_state().q
         if is_still(before, after):
@@ -190,17 +194,17 @@ def still_frame(arm: Arm, camera: Camera, timeout_s: float) -> tuple[RgbdFrame, 
         before, moved = after, np.abs(after - before)
     joint = int(moved[: z1.N_ARM].argmax())
     raise MotionError(
-        f"{z1.JOINT_NAMES[joint]} moves by {moved[joint]:.4f} rad while a picture is taken; allowed is "
-        f"{STILL_RAD} rad. Hold the arm still, or look for what shakes it."
+        f"capture: {z1.JOINT_NAMES[joint]} moves by {moved[joint]:.4f} rad during a frame, allowed is {STILL_RAD} rad. "
+        "Hold the arm still, or find the source of its vibration."
     )
 
 
 def is_still(q_before: np.ndarray, q_after: np.ndarray) -> bool:
-    """Return whether the arm's six joints are where they were."""
+    """Return whether the arm's six joints changed by less than `STILL_RAD`."""
     return bool(np.abs(q_after - q_before)[: z1.N_ARM].max() < STILL_RAD)
 
 
 def camera_model(frame: RgbdFrame) -> CameraModel:
-    """Return the camera as the device describes itself; its colour stream counts as undistorted."""
+    """Return the camera by the device's intrinsics; its colour stream counts as undistorted."""
     i = frame.intrinsics
     return CameraModel.pinhole(fx=i.fx, fy=i.fy, cx=i.cx, cy=i.cy, width=i.width, height=i.height)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from calibration.errors import CalibrationError
-from calibration.results import Calibration, load_newest, load_result
+from calibration.results import CalibrationResult, load_newest, load_result
 from hal.base import z1
 from hal.base.errors import ConfigError
 
@@ -67,7 +67,7 @@ def _nominal(serial: str, folder: Path) -> Extrinsics:
     )
 
 
-def _origin(found: Calibration) -> str:
+def _origin(found: CalibrationResult) -> str:
     errors = found.errors
     return (
         f"{found.path}, camera {found.serial}, {found.date}, "

@@ -39,10 +39,10 @@ class SelfFilter:
         self, frame: RgbdFrame, jaw: float, T_flange_camera: np.ndarray = z1.T_FLANGE_CAMERA
     ) -> np.ndarray:
         """Return the pixels (H, W) bool that may show the gripper at jaw angle `jaw` [rad]."""
-        max_depth_m = self._gripper_depth(frame.intrinsics, jaw, T_flange_camera)
+        max_depth_m = self.gripper_depth(frame.intrinsics, jaw, T_flange_camera)
         return (frame.depth_m > 0.0) & (frame.depth_m <= max_depth_m)
 
-    def _gripper_depth(self, intrinsics: Intrinsics, jaw: float, T_flange_camera: np.ndarray) -> np.ndarray:
+    def gripper_depth(self, intrinsics: Intrinsics, jaw: float, T_flange_camera: np.ndarray) -> np.ndarray:
         """Return the depth (H, W) [m] up to which a pixel may show the gripper; 0 where it is not in view."""
         T_camera_pivot = inverse(T_flange_camera) @ z1.T_FLANGE_PIVOT
         shape = gripper_shape()

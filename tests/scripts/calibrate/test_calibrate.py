@@ -1,4 +1,4 @@
-"""Calibration as an operator types it: capture, solve, verify, use; on the twin, whose truth judges the result."""
+"""Calibration on the command line: capture, solve, verify, use; on the twin, against its ground truth."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def result_of(folder: Path) -> Path:
     return path
 
 
-def test_the_twin_is_calibrated_to_its_truth_and_the_uncertainty_told_covers_the_error(calibrations: Path):
+def test_twin_is_calibrated_and_the_uncertainty_covers_the_error(calibrations: Path):
     found = load_newest(calibrations, "hand_eye", MOUNT.camera_serial())
     error_m, error_rad = pose_error(MOUNT.T_flange_camera(), found.T_flange_camera)
     assert 1e3 * error_m < min(0.2, found.errors["uncertainty_mm"])
@@ -45,10 +45,10 @@ def test_the_twin_is_calibrated_to_its_truth_and_the_uncertainty_told_covers_the
     assert found.path == result_of(calibrations)
 
 
-def test_report_and_recording_lie_beside_the_result(calibrations: Path):
+def test_report_and_recording_are_saved_with_the_result(calibrations: Path):
     result = result_of(calibrations)
     report = result.with_suffix(".html").read_text()
-    assert "truth" in report and MOUNT.camera_serial() in report
+    assert "ground truth" in report and MOUNT.camera_serial() in report
     assert result.with_suffix(".rrd").stat().st_size > 100_000
 
 
@@ -82,13 +82,13 @@ def test_intrinsics_are_found_from_the_same_samples(calibrations: Path, tmp_path
     arguments = [f"--samples={calibrations / 'samples'}", f"--calibrations={tmp_path}"]
     assert cli.main(["calibrate", "intrinsics", *arguments]) == 0
     found = load_newest(tmp_path, "intrinsics", MOUNT.camera_serial())
-    stated = load_samples(calibrations / "samples").session.camera
+    stated = load_samples(calibrations / "samples").info.camera
     assert np.abs(found.camera.matrix - stated.matrix).max() < 4.0  # ten views: no more than 1 %
     assert "<svg" in next(tmp_path.glob("intrinsics_*.html")).read_text()
 
 
-def test_the_touch_test_passes_with_the_result_and_not_without(calibrations: Path, tmp_path: Path):
-    out = tmp_path / "touch.json"
+def test_tip_check_passes_with_the_result_and_not_without(calibrations: Path, tmp_path: Path):
+    out = tmp_path / "tips.json"
     arguments = ["calibrate", "verify", f"--out={out}", "--corners=2", "--speed=1", *OPTIONS]
     assert cli.main([*arguments, f"--calibrations={calibrations}"]) == 0
     passed = json.loads(out.read_text())
@@ -102,20 +102,20 @@ def test_the_touch_test_passes_with_the_result_and_not_without(calibrations: Pat
 def test_on_a_real_arm_the_operator_types_the_offsets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     from scripts.calibrate import verify_hand_eye
 
-    def without_truth(*arguments):
-        return _NoTruth(open_robot(*arguments))
+    def without_ground_truth(*arguments):
+        return _NoGroundTruth(open_robot(*arguments))
 
-    monkeypatch.setattr(verify_hand_eye, "open_robot", without_truth)
+    monkeypatch.setattr(verify_hand_eye, "open_robot", without_ground_truth)
     answers = iter(["what?", "0.5 -1.2", "", "3 0"])
-    config = Config(out=tmp_path / "touch.json", corners=3, speed=1.0, calibrations=tmp_path, robot=RobotOptions())
+    config = Config(out=tmp_path / "tips.json", corners=3, speed=1.0, calibrations=tmp_path, robot=RobotOptions())
     assert main(config, ask=lambda _: next(answers)) == 1
     measured = json.loads(config.out.read_text())
     assert [row["offset_mm"] for row in measured["corners"]] == [[0.5, -1.2, 0.0], [3.0, 0.0, 0.0]]
     assert not measured["passed"] and measured["max_mm"] == 3.0
 
 
-class _NoTruth:
-    """A robot of which nobody knows the truth."""
+class _NoGroundTruth:
+    """A robot without ground truth."""
 
     def __init__(self, robot) -> None:
         self._robot = robot
@@ -129,16 +129,16 @@ class _NoTruth:
         self._robot.__exit__(*error)
 
 
-# --- What the demo makes of it ------------------------------------------------------------------------------
+# --- Use by the demo ------------------------------------------------------------------------------
 
 
-def test_the_demo_says_which_calibration_it_uses_and_lifts_with_it(calibrations: Path, tmp_path: Path, capfd):
+def test_demo_reports_its_calibration_and_lifts_with_it(calibrations: Path, tmp_path: Path, capfd):
     arguments = ["demo", "--lockstep", f"--out={tmp_path}", f"--calibration={result_of(calibrations)}", *OPTIONS]
     assert cli.main(arguments) == 0
     assert str(result_of(calibrations)) in capfd.readouterr().out
 
 
-def test_the_demo_refuses_the_calibration_of_another_camera(calibrations: Path, tmp_path: Path, capfd):
+def test_demo_rejects_the_calibration_of_another_camera(calibrations: Path, tmp_path: Path, capfd):
     arguments = ["demo", "--lockstep", f"--out={tmp_path}", f"--calibration={result_of(calibrations)}"]
     assert cli.main(arguments) == 2
     error = capfd.readouterr().err
@@ -164,19 +164,19 @@ def in_a_new_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "code", "said"),
+    ("arguments", "code", "text"),
     [
         (["board", "--columns=60"], 1, "180 markers"),
         (["hand-eye", "--samples=missing"], 1, "missing"),
         (["intrinsics", "--samples=missing"], 1, "missing"),
         (["capture", "--board-x-m=2"], 2, "board's x_m is 2.0"),
-        (["capture", "--poses=0"], 2, "poses is 0"),
-        (["capture", "--speed=7"], 2, "speed is 7.0"),
+        (["capture", "--poses=0"], 2, "poses 0"),
+        (["capture", "--speed=7"], 2, "speed 7.0"),
         (["verify", "--height-m=0"], 2, "height_m 0.0"),
         (["verify", "--calibration=missing.json"], 2, "missing.json"),
     ],
 )
-def test_bad_input_is_one_clear_error(in_a_new_folder, capfd, arguments: list[str], code: int, said: str):
+def test_bad_input_is_one_clear_error(in_a_new_folder, capfd, arguments: list[str], code: int, text: str):
     assert cli.main(["calibrate", *arguments]) == code
     error = capfd.readouterr().err
-    assert error.startswith("error: ") and said in error and len(error.strip().splitlines()) == 1
+    assert error.startswith("error: ") and text in error and len(error.strip().splitlines()) == 1

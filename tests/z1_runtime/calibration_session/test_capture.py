@@ -1,4 +1,4 @@
-"""Samples of a board: taken by the arm itself or by a guiding hand, on disk at once, and never from a moving arm."""
+"""Capture of samples: planned or hand-guided, saved at once, and never from a moving arm."""
 
 from __future__ import annotations
 
@@ -19,8 +19,9 @@ from hal.base.transforms import pose_error
 from scripts.support.calibration_robot import CalibrationRobot, RobotOptions, open_robot
 from scripts.support.demo_robot import lockstep_robot
 from sim_twin.model.scene import SceneConfig
-from z1_runtime.calibration_session.board_search import BoardSearch, still_frame
-from z1_runtime.calibration_session.capture import Capture, Key
+from tests.support.errors import raises
+from z1_runtime.calibration_session.board_search import BoardSearch, capture_still_frame
+from z1_runtime.calibration_session.capture import Key, SampleCapture
 from z1_runtime.geometry.kinematics import Kinematics
 from z1_runtime.motion.executor import Executor, MotionError
 from z1_runtime.motion.trajectory import MotionLimits, joint_move
@@ -35,8 +36,8 @@ def robot() -> Iterator[CalibrationRobot]:
         yield robot
 
 
-def capture_into(folder: Path, robot: CalibrationRobot, board: Board = BOARD) -> Capture:
-    return Capture(arm=robot.arm, camera=robot.camera, clock=robot.clock, board=board, folder=folder)
+def capture_into(folder: Path, robot: CalibrationRobot, board: Board = BOARD) -> SampleCapture:
+    return SampleCapture(arm=robot.arm, camera=robot.camera, clock=robot.clock, board=board, folder=folder)
 
 
 def search_with(robot: CalibrationRobot) -> BoardSearch:
@@ -49,32 +50,32 @@ def folder(robot: CalibrationRobot, tmp_path_factory: pytest.TempPathFactory) ->
     folder = tmp_path_factory.mktemp("samples")
     first = capture_into(folder, robot)
     assert first.open("2026-01-01T00:00:00+00:00") == 0
-    pictures = first.drive(search_with(robot), wanted=3)
+    pictures = first.capture_automatically(search_with(robot), wanted=3)
     name = next(pictures).name
     pictures.close()  # as Ctrl-C does
     assert [path.stem for path in folder.glob("0*.json")] == [name]
 
     second = capture_into(folder, robot)
     assert second.open("2026-01-01T00:01:00+00:00") == 1
-    assert sum(bool(taken.name) for taken in second.drive(search_with(robot), wanted=3)) == 2
-    assert len(second.taken) == 3
+    assert sum(bool(captured.name) for captured in second.capture_automatically(search_with(robot), wanted=3)) == 2
+    assert len(second.captured) == 3
     return folder
 
 
-def test_an_interrupted_capture_goes_on_where_it_stopped(folder: Path):
+def test_interrupted_capture_is_continued(folder: Path):
     loaded = load_samples(folder)
     assert len(loaded.samples) == 3 and not loaded.warnings
-    assert loaded.session.date == "2026-01-01T00:00:00+00:00"
-    assert loaded.session.serial.startswith("twin-4mm")
+    assert loaded.info.date == "2026-01-01T00:00:00+00:00"
+    assert loaded.info.serial.startswith("twin-4mm")
 
 
-def test_each_sample_tells_where_the_arm_stood(folder: Path):
+def test_each_sample_has_the_pose_of_the_arm(folder: Path):
     kinematics = Kinematics()
     for sample in load_samples(folder).samples:
         assert np.allclose(sample.T_base_flange, kinematics.flange(sample.q[:6]))
 
 
-def test_samples_taken_after_the_interruption_are_not_those_of_before(folder: Path):
+def test_samples_after_the_interruption_are_new_views(folder: Path):
     poses = [sample.T_base_flange for sample in load_samples(folder).samples]
     for i, pose in enumerate(poses):
         for other in poses[:i]:
@@ -87,7 +88,7 @@ def test_a_driven_capture_ends_at_home(robot: CalibrationRobot, folder: Path):
 
 
 def test_samples_of_another_board_are_not_mixed_in(robot: CalibrationRobot, folder: Path):
-    with pytest.raises(CalibrationError):
+    with raises(CalibrationError, "other_session"):
         capture_into(folder, robot, Board(square_m=0.03, marker_m=0.02)).open("2026-01-01T00:02:00+00:00")
     assert len(load_samples(folder).samples) == 3
 
@@ -97,8 +98,8 @@ def move(robot: CalibrationRobot, q: np.ndarray) -> None:
     Executor(robot.arm, robot.clock).execute(joint_move(start, q, MotionLimits.at_speed(1.0)))
 
 
-class Hand:
-    """Guides the arm to joint positions, one every two seconds; what it presses is asked ten times a second."""
+class Operator:
+    """Operator who guides the arm to joint positions, one every 20 polls, and presses keys at given polls."""
 
     def __init__(self, robot: CalibrationRobot, moves: list[np.ndarray], keys: dict[int, Key]) -> None:
         self._robot, self._keys = robot, keys
@@ -120,37 +121,36 @@ def test_a_guided_arm_is_sampled_when_it_holds_a_new_view_still(robot: Calibrati
     move(robot, views[0])
     past_the_board = np.append(z1.Q_HOME, 0.0)
     past_the_board[0] = 1.2
-    taken = list(capture.follow_hand(Hand(robot, [past_the_board, views[1]], {}), wanted=2))
-    assert [one.name for one in taken] == ["0001", "", "0002"]  # what shows nothing is tried once
+    taken = list(capture.capture_hand_guided(Operator(robot, [past_the_board, views[1]], {}), wanted=2))
+    assert [one.name for one in taken] == ["0001", "", "0002"]  # a view without the board is tried once
     for q, sample in zip(views, load_samples(tmp_path).samples, strict=True):
         assert np.abs(sample.q - q).max() < 5e-3
 
 
-def test_an_operator_takes_and_ends_by_hand_and_nothing_moves_the_arm(robot: CalibrationRobot, tmp_path: Path):
+def test_operator_captures_and_ends_and_nothing_moves_the_arm(robot: CalibrationRobot, tmp_path: Path):
     capture = capture_into(tmp_path, robot)
     capture.open("2026-01-01T00:00:00+00:00")
-    hand = Hand(robot, [], {3: "take", 7: "take", 9: "end"})
+    operator = Operator(robot, [], {3: "take", 7: "take", 9: "end"})
     before = robot.arm.status().trajectory_id
-    taken = list(capture.follow_hand(hand, wanted=20, by_itself=False))
+    taken = list(capture.capture_hand_guided(operator, wanted=20, automatic=False))
     assert [one.name for one in taken] == ["0001", "0002"]
     assert robot.arm.status().trajectory_id == before
 
 
-def test_a_table_without_the_board_is_told(tmp_path: Path):
+def test_table_without_the_board_is_reported(tmp_path: Path):
     with ExitStack() as undo:
         robot = undo.enter_context(lockstep_robot(SceneConfig(object="box")))
         robot.arm.claim("test")
         devices = {"arm": robot.arm, "camera": robot.camera, "clock": robot.clock, "board": BOARD}
-        capture = Capture(**devices, folder=tmp_path)
+        capture = SampleCapture(**devices, folder=tmp_path)
         capture.open("2026-01-01T00:00:00+00:00")
-        with pytest.raises(CalibrationError) as error:
-            next(capture.drive(BoardSearch(**devices, speed=1.0), wanted=3))
-        assert error.value.code == "no_board"
+        with raises(CalibrationError, "no_board"):
+            next(capture.capture_automatically(BoardSearch(**devices, speed=1.0), wanted=3))
         assert not load_samples(tmp_path).samples
 
 
 class ShakyArm:
-    """An arm that is somewhere else whenever it is looked at, until it calms down."""
+    """An arm that has moved at each of its first reads."""
 
     def __init__(self, shakes: int) -> None:
         self._shakes, self._reads = shakes, 0
@@ -163,7 +163,7 @@ class ShakyArm:
 
 
 class StillCamera:
-    """A camera that always sees the same."""
+    """A camera with a constant frame."""
 
     def __init__(self, frame: RgbdFrame) -> None:
         self._frame = frame
@@ -172,12 +172,13 @@ class StillCamera:
         return self._frame
 
 
-def test_a_picture_taken_while_the_arm_moves_is_taken_again(robot: CalibrationRobot):
+def test_frame_of_a_moving_arm_is_captured_again(robot: CalibrationRobot):
     camera = StillCamera(robot.camera.wait_for_frame(1.0))
-    _, q = still_frame(ShakyArm(3), camera, 1.0)  # pyright: ignore[reportArgumentType] (what is used of them)
+    _, q = capture_still_frame(ShakyArm(3), camera, 1.0)  # pyright: ignore[reportArgumentType] (what is used of them)
     assert q[3] == pytest.approx(z1.Q_HOME[3] + 0.03)
-    with pytest.raises(MotionError, match=r"joint4 moves by 0\.0100 rad.*allowed is 0\.001 rad"):
-        still_frame(ShakyArm(100), camera, 1.0)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(MotionError) as caught:
+        capture_still_frame(ShakyArm(100), camera, 1.0)  # pyright: ignore[reportArgumentType]
+    assert "joint4 moves by 0.0100 rad" in str(caught.value) and "allowed is 0.001 rad" in str(caught.value)
 
 
 def test_the_coverage_grows_with_every_sample(robot: CalibrationRobot, folder: Path):
@@ -185,9 +186,9 @@ def test_the_coverage_grows_with_every_sample(robot: CalibrationRobot, folder: P
 
     capture = capture_into(folder, robot)
     capture.open("2026-01-01T00:00:00+00:00")
-    covers = [Coverage.of(capture.taken[:n]) for n in range(4)]
-    shares = [(cover.corners > 0).mean() for cover in covers]
-    assert shares[0] == 0.0 and shares[-1] > 0.3
-    assert all(after >= before for before, after in pairwise(shares))
-    assert covers[1].turns_deg.max() == 0.0 and covers[3].turns_deg.max() > 20.0
-    assert covers[3].picture().count("\n") == 8 and "°" in covers[3].summary()
+    covers = [Coverage.of(capture.captured[:n]) for n in range(4)]
+    ratios = [(cover.corners > 0).mean() for cover in covers]
+    assert ratios[0] == 0.0 and ratios[-1] > 0.3
+    assert all(after >= before for before, after in pairwise(ratios))
+    assert covers[1].rotation_spread_deg.max() == 0.0 and covers[3].rotation_spread_deg.max() > 20.0
+    assert covers[3].draw_map().count("\n") == 8 and "°" in covers[3].summary()

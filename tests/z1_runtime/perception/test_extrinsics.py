@@ -10,7 +10,7 @@ import pytest
 
 from calibration.board.board import Board
 from calibration.camera_model import CameraModel
-from calibration.results import MAX_UNCERTAINTY_MM, Calibration, save_result
+from calibration.results import MAX_UNCERTAINTY_MM, CalibrationResult, save_result
 from hal.base import z1
 from hal.base.errors import ConfigError
 from z1_runtime.perception.extrinsics import find_extrinsics, results_folder
@@ -36,7 +36,7 @@ def keep(folder: Path, serial: str, shift_m: float, *, uncertainty_mm: float = 0
         "T_anchor_board": np.eye(4),
         "covariance": 1e-8 * np.eye(6),
     }
-    return save_result(folder, Calibration(**{**fields, **changes}))
+    return save_result(folder, CalibrationResult(**{**fields, **changes}))
 
 
 def shift_m(T_flange_camera: np.ndarray) -> float:
