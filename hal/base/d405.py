@@ -165,7 +165,7 @@ class FrameSource(Protocol):
         """False while the cable is out."""
         ...
 
-    def expose(self, look: CaptureRequest) -> Exposure | None:
+    def expose(self, request: CaptureRequest) -> Exposure | None:
         """Return what is seen now; None = the camera hangs and delivers nothing."""
         ...
 

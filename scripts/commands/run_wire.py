@@ -71,13 +71,13 @@ def main(arguments: list[str]) -> int:
         print(READY, flush=True)
         if config.view:
             _show(twin, config.view_port, stop_event)
-        while not stop_event.wait(_LOOK_S) and twin.alive:
+        while not stop_event.wait(_LOOK_S) and twin.running:
             pass
-        if ended := twin.why_it_ended():
+        if ended := twin.exit_reason():
             raise HalError(ended)
-        account = twin.account()
-    why = f" (the last one: {account['last_refusal']})" if account["refused"] else ""
-    print(f"{account['answers']} answers; {account['refused']} datagrams were no commands{why}")
+        statistics = twin.statistics()
+    why = f" (the last one: {statistics['invalid_reason']})" if statistics["invalid_datagrams"] else ""
+    print(f"{statistics['answers']} answers; {statistics['invalid_datagrams']} datagrams were no commands{why}")
     return 0
 
 
@@ -112,7 +112,7 @@ def _show(twin: WireProcess, port: int, stop_event: Event) -> None:
 
     view = TwinView(twin, port=port)
     try:
-        while not stop_event.wait(1.0 / RATE_HZ) and twin.alive:
+        while not stop_event.wait(1.0 / RATE_HZ) and twin.running:
             view.update()
     finally:
         view.close()

@@ -65,7 +65,7 @@ def test_it_loses_or_refuses_commands_when_told(arm: MockArm) -> None:
     assert arm.send(ArmSetpoint(q=MIDDLE + 0.1, dq=ZERO)).q == pytest.approx(MIDDLE + 0.1)
     let_pass(arm, 1.0)
     assert arm.read_state().q == pytest.approx(MIDDLE)
-    arm.refuse_commands = True
+    arm.reject_commands = True
     with pytest.raises(CommandRejectedError):
         arm.send(ArmSetpoint(q=MIDDLE, dq=ZERO))
 

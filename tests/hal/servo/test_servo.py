@@ -450,11 +450,11 @@ def test_an_arm_that_takes_no_commands_is_latched_and_left_alone() -> None:
     bench = Bench()
     bench.servo.stream(move())
     bench.run(0.5)
-    bench.arm.refuse_commands = True
+    bench.arm.reject_commands = True
     bench.run(1.0)
     assert bench.mode is STOPPED
     assert "takes no commands" in bench.reason
-    bench.arm.refuse_commands = False
+    bench.arm.reject_commands = False
     stuck = bench.servo.status().q_command
     bench.run(0.1)
     assert bench.servo.status().q_command == pytest.approx(stuck)

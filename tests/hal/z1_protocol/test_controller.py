@@ -74,7 +74,7 @@ def test_joint_commands_are_the_golden_bytes_both_ways() -> None:
 def test_a_buffer_writes_the_same_bytes_without_making_new_ones() -> None:
     buffer = CommandBuffer()
     data = buffer.data
-    buffer.head(Fsm.JOINTCTRL, track=True)
+    buffer.set_head(Fsm.JOINTCTRL, track=True)
     for name, value in (("tau", 1.0), ("dq", 0.5), ("q", -2.0), ("kp", 20.0), ("kd", 2000.0)):
         buffer.joints[name] = one_joint(value)
     assert bytes(buffer.data) == GOLDEN_COMMAND

@@ -20,7 +20,7 @@ from hal.z1_protocol.controller import (
     encode_command,
 )
 from hal.z1_protocol.records import JointCommands, JointStates, ProtocolError
-from hal.z1_protocol.states import MOVES, Fsm, granted
+from hal.z1_protocol.states import MOVES, Fsm, is_granted
 from sim_twin.controller.controlled_world import ControlledWorld
 from sim_twin.controller.controller import LABEL_SPEED, Controller
 from sim_twin.model.scene import SceneConfig
@@ -120,7 +120,7 @@ def brought_to(state: Fsm) -> IdealArm:
 def test_every_request_is_granted_or_ignored_as_the_table_says(now: Fsm) -> None:
     for asked in Fsm:
         arm = brought_to(now)
-        follows = granted(now, asked) and asked is not Fsm.INVALID and asked not in UNSUPPORTED
+        follows = is_granted(now, asked) and asked is not Fsm.INVALID and asked not in UNSUPPORTED
         assert arm.ask(asked, bodies(asked)) is (asked if follows else now), asked.name
 
 

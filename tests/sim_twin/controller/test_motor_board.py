@@ -9,11 +9,11 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from hal.backends.z1.torque import FeedForward
+from hal.backends.z1.torque_limits import FeedForward
 from hal.base import z1
 from hal.base.clock import WallClock
 from hal.z1_protocol.records import MotorError, MotorLink
-from sim_twin.controller.motor_board import ArmBoard
+from sim_twin.controller.motor_board import MotorBoard
 from sim_twin.drop_in.config import WireConfig
 from sim_twin.drop_in.rig import free_ports
 from sim_twin.drop_in.udp_server import WireServer
@@ -37,8 +37,8 @@ def positions(state: bytes) -> np.ndarray:
 
 
 @pytest.fixture
-def board() -> ArmBoard:
-    return ArmBoard(World(SceneConfig()))
+def board() -> MotorBoard:
+    return MotorBoard(World(SceneConfig()))
 
 
 class Controller:
@@ -50,7 +50,7 @@ class Controller:
     def command(self, state: bytes, q: np.ndarray) -> bytes:
         return command(q, self._weight.torque(positions(state), np.zeros(7)))
 
-    def drive(self, board: ArmBoard, goals: list[np.ndarray]) -> bytes:
+    def drive(self, board: MotorBoard, goals: list[np.ndarray]) -> bytes:
         """Exchange at 250 Hz, one goal after the other; return the last state."""
         state = board.hear(bytes(140))
         for q in goals:
@@ -63,14 +63,14 @@ class Controller:
         return state
 
 
-def test_the_self_check_is_answered_motor_by_motor(board: ArmBoard) -> None:
+def test_the_self_check_is_answered_motor_by_motor(board: MotorBoard) -> None:
     assert board.hear(b"\x02") == bytes.fromhex("20 08 01 01 01 01 01 01 01 01")
     board.motors.link[1, 1] = MotorLink.LOST
     assert board.hear(b"\x02") == bytes.fromhex("20 08 01 01 00 01 01 01 01 01")
 
 
 def test_without_a_gripper_there_are_seven_motors_and_six_records() -> None:
-    board = ArmBoard(World(SceneConfig()), gripper=False)
+    board = MotorBoard(World(SceneConfig()), gripper=False)
     assert board.hear(b"\x02") == bytes.fromhex("20 07 01 01 01 01 01 01 01")
     answer = board.hear(bytes(120))
     assert answer is not None
@@ -79,7 +79,7 @@ def test_without_a_gripper_there_are_seven_motors_and_six_records() -> None:
     assert "140 bytes; of this board, with 6 joints, they have 120" in board.last_refusal
 
 
-def test_zeros_are_answered_with_154_bytes_of_measurements(board: ArmBoard) -> None:
+def test_zeros_are_answered_with_154_bytes_of_measurements(board: MotorBoard) -> None:
     state = board.hear(bytes(140))
     assert state is not None
     assert len(state) == 154
@@ -87,7 +87,7 @@ def test_zeros_are_answered_with_154_bytes_of_measurements(board: ArmBoard) -> N
     assert state[16:22] == bytes([30, 0, 0, 30, 0, 0])  # 30 °C, no error, heard
 
 
-def test_the_arm_is_parked_until_the_first_command_and_then_limp(board: ArmBoard) -> None:
+def test_the_arm_is_parked_until_the_first_command_and_then_limp(board: MotorBoard) -> None:
     board.hear(b"\x02")
     for _ in range(250):
         board.tick()
@@ -100,7 +100,7 @@ def test_the_arm_is_parked_until_the_first_command_and_then_limp(board: ArmBoard
     assert np.abs(board.world.read_arm()[0] - positions(state)).max() > 0.05
 
 
-def test_the_vendors_gains_hold_the_arm_and_move_it(board: ArmBoard) -> None:
+def test_the_vendors_gains_hold_the_arm_and_move_it(board: MotorBoard) -> None:
     controller = Controller()
     state = controller.drive(board, [START] * 250)
     assert positions(state) == pytest.approx(START, abs=0.02)
@@ -110,7 +110,7 @@ def test_the_vendors_gains_hold_the_arm_and_move_it(board: ArmBoard) -> None:
     assert positions(state) == pytest.approx(goal, abs=0.02)
 
 
-def test_a_motors_record_tells_what_ails_it(board: ArmBoard) -> None:
+def test_a_motors_record_tells_what_ails_it(board: MotorBoard) -> None:
     board.motors.error[1, 1] = MotorError.OVERHEAT
     board.motors.link[4, 0] = MotorLink.CRC_ERROR
     board.motors.temperature_c[1, 1] = 71.4
@@ -120,7 +120,7 @@ def test_a_motors_record_tells_what_ails_it(board: ArmBoard) -> None:
     assert state[4 * 22 + 16 : 4 * 22 + 19] == bytes([30, 0, 2 << 6])
 
 
-def test_a_dead_board_answers_nothing_and_passes_nothing_on(board: ArmBoard) -> None:
+def test_a_dead_board_answers_nothing_and_passes_nothing_on(board: MotorBoard) -> None:
     Controller().drive(board, [START] * 100)
     board.motors.silent = True
     assert board.hear(b"\x02") is None
@@ -134,7 +134,7 @@ def test_a_dead_board_answers_nothing_and_passes_nothing_on(board: ArmBoard) -> 
 
 
 @pytest.mark.parametrize("at", [0, 4, 8, 12, 16])
-def test_a_number_that_is_none_is_refused_and_moves_nothing(board: ArmBoard, at: int) -> None:
+def test_a_number_that_is_none_is_refused_and_moves_nothing(board: MotorBoard, at: int) -> None:
     board.hear(command(START, np.zeros(7)))
     bad = bytearray(command(START, np.zeros(7)))
     bad[at : at + 4] = struct.pack("<f", float("nan"))
@@ -143,7 +143,7 @@ def test_a_number_that_is_none_is_refused_and_moves_nothing(board: ArmBoard, at:
     assert "must be finite" in board.last_refusal
 
 
-def test_random_bytes_are_counted_and_never_crash(board: ArmBoard) -> None:
+def test_random_bytes_are_counted_and_never_crash(board: MotorBoard) -> None:
     rng = np.random.default_rng(3)
     good = command(START, np.zeros(7))
     for i in range(5000):
@@ -166,7 +166,7 @@ def test_random_bytes_are_counted_and_never_crash(board: ArmBoard) -> None:
 @pytest.fixture
 def ports() -> Iterator[list[int]]:
     configs = [WireConfig(depth="board", board_port=port) for port in free_ports()]
-    servers = [WireServer(ArmBoard(World(SceneConfig())), config) for config in configs]
+    servers = [WireServer(MotorBoard(World(SceneConfig())), config) for config in configs]
     with servers[0], servers[1]:
         yield [config.board_port for config in configs]
 

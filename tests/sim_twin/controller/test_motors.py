@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hal.backends.z1.torque import FeedForward
+from hal.backends.z1.torque_limits import FeedForward
 from hal.base import z1
 from hal.z1_protocol.controller import KD_JOINTCTRL, KP_JOINTCTRL
 from hal.z1_protocol.records import JointCommands, MotorError, MotorLink

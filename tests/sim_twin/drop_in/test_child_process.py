@@ -39,10 +39,10 @@ def await_true(condition: Callable[[], bool], timeout_s: float = 30.0) -> None:
 
 def test_it_ends_when_it_is_closed_and_only_once() -> None:
     child = start()
-    assert child.alive
-    assert child.why_it_ended(0.0) == ""
+    assert child.running
+    assert child.exit_reason(0.0) == ""
     child.close()
-    assert not child.alive
+    assert not child.running
     child.close()
 
 

@@ -26,7 +26,7 @@ from sim_twin.drop_in.camera_process import RemoteSource
 from sim_twin.drop_in.config import WireConfig
 from sim_twin.drop_in.process import WireProcess
 from sim_twin.drop_in.realsense_source import TwinSource
-from sim_twin.drop_in.rig import WiredArm, WiredCamera, free_ports
+from sim_twin.drop_in.rig import WireSimArm, WireSimCamera, free_ports
 from sim_twin.drop_in.shared_memory import SharedWorld, make_memory
 from sim_twin.ground_truth import read_ground_truth
 from sim_twin.model.scene import SceneConfig
@@ -81,7 +81,7 @@ def test_what_is_published_is_read_and_what_is_half_written_is_not() -> None:
 
 @pytest.mark.parametrize("mode", [Z1Mode.TRACKING, Z1Mode.LOW_LEVEL])
 def test_the_real_driver_moves_the_twin(twin: WireProcess, mode: Z1Mode) -> None:
-    arm = WiredArm(twin, WallClock(), mode)
+    arm = WireSimArm(twin, WallClock(), mode)
     arm.connect()
     goal = np.clip(arm.read_state().q, z1.Q_MIN, z1.Q_MAX)
     goal[0] += 0.3
@@ -94,11 +94,11 @@ def test_the_real_driver_moves_the_twin(twin: WireProcess, mode: Z1Mode) -> None
     assert arm.read_state().faults == ()
     assert twin.poses()[1][0] == pytest.approx(goal[0], abs=0.03)
     arm.disconnect()
-    assert twin.alive  # as a controller is, when its client has gone
+    assert twin.running  # as a controller is, when its client has gone
 
 
 def test_the_real_driver_reads_the_twins_faults(twin: WireProcess) -> None:
-    arm = WiredArm(twin, WallClock())
+    arm = WireSimArm(twin, WallClock())
     arm.connect()
     twin.error[1, 1] = MotorError.OVERHEAT
     await_true(lambda: "joint2 motor 2: overheat" in arm.read_state().faults)
@@ -112,7 +112,7 @@ def test_the_truth_is_told_from_here(twin: WireProcess) -> None:
     assert truth.lifted_m == pytest.approx(0.0, abs=1e-3)
     assert truth.T_base_object[0, 3] == pytest.approx(0.48, abs=0.01)
     assert twin.model.nq == len(truth.qpos) == 14
-    assert twin.account()["answers"] > 0
+    assert twin.statistics()["answers"] > 0
 
 
 def test_a_port_that_is_taken_is_said_here(twin: WireProcess) -> None:
@@ -126,7 +126,7 @@ def test_a_port_that_is_taken_is_said_here(twin: WireProcess) -> None:
 
 @needs_librealsense
 def test_the_real_camera_driver_sees_the_world_of_the_other_process(twin: WireProcess) -> None:
-    camera = WiredCamera(twin, D405CameraConfig(warm_up_s=0.0))
+    camera = WireSimCamera(twin, D405CameraConfig(warm_up_s=0.0))
     camera.connect()
     frame = camera.wait_for_frame(10.0)
     camera.disconnect()
@@ -158,10 +158,10 @@ def test_pictures_cross_as_they_were_drawn() -> None:
 
 def test_the_rig_is_known_by_its_name_and_starts_nothing_yet() -> None:
     rig = RIGS.make("wire-sim", scene=SceneConfig(object="box"))
-    assert isinstance(rig.arm, WiredArm)
-    assert isinstance(rig.camera, WiredCamera)
+    assert isinstance(rig.arm, WireSimArm)
+    assert isinstance(rig.camera, WireSimCamera)
     assert rig.world.config.object == "box"
-    assert not rig.world.alive
+    assert not rig.world.running
     assert rig.call_every_tick is None
     rig.arm.disconnect()
 
@@ -172,11 +172,11 @@ def test_worlds_here_and_there_begin_alike(twin: WireProcess) -> None:
 
 
 def test_a_controller_that_was_killed_is_what_the_driver_says(twin: WireProcess) -> None:
-    arm = WiredArm(twin, WallClock())
+    arm = WireSimArm(twin, WallClock())
     arm.connect()
     assert twin._child is not None
     os.kill(twin._child.pid, signal.SIGKILL)
-    await_true(lambda: not twin.alive)
+    await_true(lambda: not twin.running)
     clock = WallClock()
     with pytest.raises(HalError, match="process of the twin's controller was killed by signal 9"):
         while True:
@@ -184,5 +184,5 @@ def test_a_controller_that_was_killed_is_what_the_driver_says(twin: WireProcess)
             clock.sleep_until(clock.now_s() + 0.01)
     arm.disconnect()
     with pytest.raises(HalError, match="killed by signal 9"):
-        twin.account()
+        twin.statistics()
     twin.close()

@@ -78,8 +78,8 @@ def test_garbage_is_dropped_and_the_next_command_answered(server: WireServer) ->
         for size in (0, 1, 146, 148, 1400, 9000):
             client.socket.sendto(rng.bytes(size), (server.config.host, server.config.command_port))
         assert decode_state(client.exchange(encode_command(Fsm.INVALID))).state is Fsm.PASSIVE
-    assert server.twin.refused == 6
-    assert server.alive
+    assert server.twin.invalid_datagrams == 6
+    assert server.running
 
 
 def test_a_client_that_is_gone_is_not_missed(server: WireServer) -> None:
@@ -119,7 +119,7 @@ def test_it_can_be_started_again_and_twice(server: WireServer) -> None:
     server.start()
     server.stop()
     server.stop()
-    assert not server.alive
+    assert not server.running
     server.start()
     with Client(server.config) as client:
         assert len(client.exchange(encode_command(Fsm.INVALID))) == 208
@@ -139,7 +139,7 @@ def test_what_ends_its_thread_is_told_by_stop() -> None:
     server = make_server()
     server.twin.world.step = lambda: 1 / 0  # pyright: ignore[reportAttributeAccessIssue] - a world that fails
     server.start()
-    await_true(lambda: not server.alive)
+    await_true(lambda: not server.running)
     with pytest.raises(ZeroDivisionError):
         server.stop()
 

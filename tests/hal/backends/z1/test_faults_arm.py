@@ -11,7 +11,7 @@ from hal.z1_protocol.controller import encode_command
 from hal.z1_protocol.records import MotorError, MotorLink
 from hal.z1_protocol.states import Fsm
 from tests.support.faults_table import FaultsTable
-from tests.support.hal.wired_bench import WiredBench
+from tests.support.hal.wire_bench import WireBench
 
 pytestmark = pytest.mark.faults
 
@@ -30,7 +30,7 @@ pytestmark = pytest.mark.faults
 def test_a_motors_fault_bit(
     motor: tuple[int, int], field: str, value: MotorError | MotorLink, faults_table: FaultsTable
 ) -> None:
-    bench = WiredBench()
+    bench = WireBench()
     bench.play(lambda: getattr(bench.twin.motors, field).__setitem__(motor, value))
     bench.assert_safe()
     assert bench.status.mode is ServoMode.STOPPED
@@ -40,7 +40,7 @@ def test_a_motors_fault_bit(
 
 @pytest.mark.parametrize("mode", [Z1Mode.TRACKING, Z1Mode.LOW_LEVEL])
 def test_a_board_that_falls_silent(mode: Z1Mode, faults_table: FaultsTable) -> None:
-    bench = WiredBench(mode)
+    bench = WireBench(mode)
     bench.play(lambda: setattr(bench.twin.motors, "silent", True))
     bench.assert_safe()
     assert bench.status.mode is ServoMode.STOPPED
@@ -50,7 +50,7 @@ def test_a_board_that_falls_silent(mode: Z1Mode, faults_table: FaultsTable) -> N
 
 @pytest.mark.parametrize("mode", [Z1Mode.TRACKING, Z1Mode.LOW_LEVEL])
 def test_a_controller_that_is_gone(mode: Z1Mode, faults_table: FaultsTable) -> None:
-    bench = WiredBench(mode)
+    bench = WireBench(mode)
     bench.play(lambda: setattr(bench.link, "mangle", lambda data: []))
     bench.assert_safe()
     assert bench.status.mode is ServoMode.STOPPED
@@ -59,7 +59,7 @@ def test_a_controller_that_is_gone(mode: Z1Mode, faults_table: FaultsTable) -> N
 
 
 def test_a_controller_switched_by_somebody_else(faults_table: FaultsTable) -> None:
-    bench = WiredBench()
+    bench = WireBench()
     bench.play(lambda: bench.twin.take(encode_command(Fsm.CARTESIAN)) and None)
     bench.assert_safe()
     assert bench.status.mode is ServoMode.STOPPED
@@ -68,7 +68,7 @@ def test_a_controller_switched_by_somebody_else(faults_table: FaultsTable) -> No
 
 
 def test_a_clock_that_jumps(faults_table: FaultsTable) -> None:
-    bench = WiredBench()
+    bench = WireBench()
     bench.play(lambda: setattr(bench.clock, "ahead_s", 3600.0))
     bench.assert_safe()
     assert bench.status.mode is not ServoMode.TRACKING
@@ -77,7 +77,7 @@ def test_a_clock_that_jumps(faults_table: FaultsTable) -> None:
 
 def test_a_push_that_is_stronger_than_a_motor(faults_table: FaultsTable) -> None:
     push_nm, push_s = 33.0, 0.3
-    bench = WiredBench()
+    bench = WireBench()
 
     def push() -> None:
         lasts = bench.world.time_s < bench.fault_s + push_s
