@@ -1,4 +1,4 @@
-"""The vendor's state machine, as it was observed."""
+"""The vendor's state machine, as it was measured."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from hal.z1_protocol.states import MOVES, Fsm, is_granted
 
 
 @pytest.mark.parametrize(
-    ("now", "asked", "expected"),
+    ("present", "requested", "expected"),
     [
         (Fsm.PASSIVE, Fsm.JOINTCTRL, True),
         (Fsm.PASSIVE, Fsm.CARTESIAN, True),
@@ -28,8 +28,8 @@ from hal.z1_protocol.states import MOVES, Fsm, is_granted
         (Fsm.TEACH, Fsm.JOINTCTRL, True),
     ],
 )
-def test_a_request_is_granted_as_the_controller_grants_it(now: Fsm, asked: Fsm, expected: bool) -> None:
-    assert is_granted(now, asked) is expected
+def test_a_request_is_granted_as_the_controller_grants_it(present: Fsm, requested: Fsm, expected: bool) -> None:
+    assert is_granted(present, requested) is expected
 
 
 @pytest.mark.parametrize("state", list(Fsm))

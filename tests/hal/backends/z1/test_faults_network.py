@@ -1,4 +1,4 @@
-"""A bad network between the real Z1's driver and its arm, and whoever else sends to their ports."""
+"""A bad network between the real Z1's driver and its arm, and other senders to their ports."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def test_a_tenth_of_all_datagrams(fate: str, faults_table: FaultsTable) -> None:
     assert network.touched > 100
     bench.assert_safe()
     assert bench.status.finished or bench.status.mode is ServoMode.STOPPED
-    bench.tell(faults_table, f"10 % of all datagrams {fate}")
+    bench.report(faults_table, f"10 % of all datagrams {fate}")
 
 
 def test_random_datagrams(faults_table: FaultsTable) -> None:
@@ -49,6 +49,6 @@ def test_random_datagrams(faults_table: FaultsTable) -> None:
 
     bench.play(lambda: setattr(bench.link, "mangle", flood))
     assert sent >= FUZZ
-    assert bench.twin.refused + bench.arm.diagnostics().counts.refused > 0.9 * FUZZ
+    assert bench.twin.invalid_datagrams + bench.arm.diagnostics().counts.invalid > 0.9 * FUZZ
     bench.assert_safe()
-    bench.tell(faults_table, f"{sent:,} random datagrams")
+    bench.report(faults_table, f"{sent:,} random datagrams")
