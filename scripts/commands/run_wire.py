@@ -107,7 +107,7 @@ def start_pose(start: Literal["startFlat", "home"]) -> np.ndarray | None:
 
 
 def _show(twin: WireProcess, port: int, stop_event: Event) -> None:
-    """Show the twin until `stop_event` is set, or it is gone."""
+    """Show the twin until `stop_event` is set, or its process ends."""
     from scripts.support.twin_view import RATE_HZ, TwinView
 
     view = TwinView(twin, port=port)

@@ -40,7 +40,7 @@ _MAX_DATAGRAMS = 1024
 # An answer is an outlier when a joint moved by more than the first, plus the second times the time since the last one.
 _JUMP_RAD = 0.1
 _JUMP_SPEED = 3.0 * float(DQ_MAX.max())
-# Answers still on their way from before a request was granted are no state change.
+# Answers sent before a request was granted still arrive after it: one alone is no state change.
 _LEFT_COUNT = 3
 _MAX_REASON_CHARS = 200
 
@@ -95,7 +95,7 @@ class Z1Client:
         self._raw = b""
         self._outlier: np.ndarray | None = None
 
-    # --- Connection ---------------------------------------------------------------------------------------------
+    # --- Connection -----------------------------------------------------------------------------------------------
 
     def open(self, timeout_s: float) -> None:
         """Open the link and wait for an answer; the command sent requests no state change.
@@ -127,7 +127,7 @@ class Z1Client:
         self.link.close()
         self._newest = None
 
-    # --- One exchange -------------------------------------------------------------------------------------------
+    # --- One exchange ---------------------------------------------------------------------------------------------
 
     @property
     def newest(self) -> ControllerState:
@@ -212,7 +212,7 @@ class Z1Client:
                 f"the controller changed from {self.expected.name} to {state.name} without a request", now_s
             )
 
-    # --- Requests -----------------------------------------------------------------------------------------------
+    # --- Requests -------------------------------------------------------------------------------------------------
 
     def request_state(
         self, requested: Fsm, body: JointCommands | TrajectoryCommand | str | None = None, *, timeout_s: float = 0.3

@@ -13,7 +13,7 @@ from hal.z1_protocol.controller import TrajectoryCommand
 from hal.z1_protocol.states import MOVES, Fsm
 
 MOVE_TIMEOUT_S = 60.0
-"""Timeout of one motion [s]; the longest one of the twin's controller takes a few seconds."""
+"""Timeout of one motion [s]; those of the vendor's controller take a few seconds (measured)."""
 
 
 class ControllerMotions:

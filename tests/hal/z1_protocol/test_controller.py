@@ -60,7 +60,7 @@ def test_states_have_their_numbers_on_the_wire() -> None:
     assert list(map(int, sorted(Fsm))) == list(range(17))
 
 
-def test_joint_commands_are_the_golden_bytes_both_ways() -> None:
+def test_joint_commands_are_the_golden_bytes_in_both_directions() -> None:
     joints = JointCommands(
         tau=one_joint(1.0), dq=one_joint(0.5), q=one_joint(-2.0), kp=one_joint(20.0), kd=one_joint(2000.0)
     )
@@ -86,7 +86,7 @@ def test_a_new_buffer_requests_no_state_change() -> None:
     assert bytes(CommandBuffer().data) == b"\xfe\xff" + bytes(145)
 
 
-def test_states_are_the_golden_bytes_both_ways() -> None:
+def test_states_are_the_golden_bytes_in_both_directions() -> None:
     assert controller.encode_state(golden_state()) == GOLDEN_STATE
     read = controller.decode_state(GOLDEN_STATE)
     assert read.state is Fsm.LOWCMD

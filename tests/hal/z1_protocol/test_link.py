@@ -37,7 +37,7 @@ def link(peer: socket.socket) -> Iterator[UdpLink]:
     link.close()
 
 
-def test_datagrams_go_both_ways(link: UdpLink, peer: socket.socket) -> None:
+def test_datagrams_are_exchanged_in_both_directions(link: UdpLink, peer: socket.socket) -> None:
     assert link.send(b"question")
     data, address = peer.recvfrom(100)
     assert data == b"question"

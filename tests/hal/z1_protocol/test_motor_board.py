@@ -39,7 +39,7 @@ STATE_RECORD = bytes.fromhex("0000803f 0000003f 00000000 000000c0 19 00 00 19 00
 
 
 @pytest.mark.parametrize(("n", "size"), [(7, 140), (6, 120)])
-def test_commands_are_the_golden_bytes_both_ways(n: int, size: int) -> None:
+def test_commands_are_the_golden_bytes_in_both_directions(n: int, size: int) -> None:
     data = motor_board.encode_command(commands(n))
     assert data == COMMAND_RECORD * n
     assert len(data) == size
@@ -49,7 +49,7 @@ def test_commands_are_the_golden_bytes_both_ways(n: int, size: int) -> None:
 
 
 @pytest.mark.parametrize(("n", "size"), [(7, 154), (6, 132)])
-def test_states_are_the_golden_bytes_both_ways(n: int, size: int) -> None:
+def test_states_are_the_golden_bytes_in_both_directions(n: int, size: int) -> None:
     data = motor_board.encode_state(states(n))
     assert data == STATE_RECORD * n
     assert len(data) == size
@@ -66,7 +66,7 @@ def test_the_old_format_without_motor_records_is_accepted() -> None:
     assert not read.link.any()
 
 
-def test_the_self_check_is_the_golden_bytes_both_ways() -> None:
+def test_the_self_check_is_the_golden_bytes_in_both_directions() -> None:
     assert motor_board.SELF_CHECK == b"\x02"
     assert motor_board.encode_self_check([1] * 8) == bytes.fromhex("20 08 01 01 01 01 01 01 01 01")
     assert motor_board.decode_self_check(bytes.fromhex("20 07 01 01 00 01 01 01 01")) == (1, 1, 0, 1, 1, 1, 1)

@@ -142,7 +142,7 @@ def test_back_to_start_may_begin_in_passive(arm: IdealArm) -> None:
     assert arm.states.q[6] == START[6]
 
 
-# --- Motions of the controller ------------------------------------------------------------------------------------------------
+# --- Motions of the controller ------------------------------------------------------------------------------------
 
 
 def test_movej_reaches_its_goal_within_the_requested_speed(arm: IdealArm) -> None:
@@ -273,7 +273,7 @@ def test_calibration_makes_the_present_pose_the_zero_and_ends_in_passive(arm: Id
     assert arm.states.q == pytest.approx(START)
 
 
-# --- Tracking -------------------------------------------------------------------------------------------------------
+# --- Tracking -----------------------------------------------------------------------------------------------------
 
 
 def test_tracking_catches_up_at_pi_radians_a_second(arm: IdealArm) -> None:
@@ -333,7 +333,7 @@ def test_a_tracked_pose_is_followed_and_one_out_of_reach_is_not(arm: IdealArm) -
     assert arm.controller.fsm is Fsm.CARTESIAN
 
 
-# --- PASSIVE and LOWCMD ---------------------------------------------------------------------------------------------
+# --- PASSIVE and LOWCMD -------------------------------------------------------------------------------------------
 
 
 def test_passive_is_damping_alone(arm: IdealArm) -> None:
@@ -377,7 +377,7 @@ def test_a_body_that_is_not_finite_changes_nothing(arm: IdealArm) -> None:
     assert arm.controller.fsm is Fsm.JOINTCTRL
 
 
-# --- On the twin's physics ------------------------------------------------------------------------------------------
+# --- On the twin's physics ----------------------------------------------------------------------------------------
 
 
 @pytest.fixture

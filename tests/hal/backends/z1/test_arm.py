@@ -83,7 +83,7 @@ def make_turn(bench: Bench) -> TrajectoryCommand:
     return TrajectoryCommand(poses=np.array([posture, np.zeros(6)]), gripper_rad=bench.peer.q[6])
 
 
-# --- Connecting -----------------------------------------------------------------------------------------------------
+# --- Connecting ---------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("fsm", [Fsm.PASSIVE, Fsm.JOINTCTRL, Fsm.CARTESIAN, Fsm.LOWCMD, Fsm.TEACH])
@@ -166,7 +166,7 @@ def test_disconnecting_leaves_a_controller_that_holds(bench: Bench, low: Bench) 
         assert np.abs(one.peer.q - before).max() < 1e-3
 
 
-# --- Commands of the driver -----------------------------------------------------------------------------------------
+# --- Commands of the driver ---------------------------------------------------------------------------------------
 
 
 def test_a_far_target_is_handed_over_one_period_at_a_time(bench: Bench) -> None:
@@ -278,10 +278,10 @@ def test_an_arm_that_does_not_hold_is_given_back_to_the_controller(bench: Bench)
     assert bench.peer.fsm is Fsm.JOINTCTRL
 
 
-# --- Gripper --------------------------------------------------------------------------------------------------------
+# --- Gripper ------------------------------------------------------------------------------------------------------
 
 
-def test_the_gripper_goes_to_a_position(bench: Bench) -> None:
+def test_the_gripper_moves_to_a_position(bench: Bench) -> None:
     bench.run(bench.shift(6, -0.5), 1.0)
     assert bench.peer.q[6] == pytest.approx(-1.0, abs=0.01)
 
@@ -313,7 +313,7 @@ def test_a_grip_torque_beyond_the_limit_is_rejected(bench: Bench, torque_nm: flo
     assert f"{torque_nm} Nm; allowed are −3.0 to 3.0 Nm" in str(caught.value)
 
 
-# --- Motions of the controller --------------------------------------------------------------------------------
+# --- Motions of the controller ------------------------------------------------------------------------------------
 
 
 def test_it_runs_to_a_label_and_back_to_start(bench: Bench) -> None:
@@ -377,7 +377,7 @@ def test_passive_lets_the_arm_sink(bench: Bench) -> None:
         bench.arm.send(ArmSetpoint(q=bench.peer.q, dq=REST))
 
 
-# --- Faults ---------------------------------------------------------------------------------------------------------
+# --- Faults -------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -525,7 +525,7 @@ def test_a_hostile_network_raises_only_known_errors() -> None:
     assert np.abs(bench.peer.q - q).max() < 0.5
 
 
-# --- Under the servo ------------------------------------------------------------------------------------------------
+# --- Under the servo ----------------------------------------------------------------------------------------------
 
 
 def play(bench: Bench, inject_fault: Callable[[], None]) -> Servo:

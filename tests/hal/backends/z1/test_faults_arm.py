@@ -55,7 +55,7 @@ def test_a_controller_without_answers(mode: Z1Mode, faults_table: FaultsTable) -
     bench.assert_safe()
     assert bench.status.mode is ServoMode.STOPPED
     assert "has not answered" in bench.status.reason
-    bench.report(faults_table, f"controller gone, or its cable ({mode})")
+    bench.report(faults_table, f"controller ended, or its cable unplugged ({mode})")
 
 
 def test_a_controller_switched_by_another_program(faults_table: FaultsTable) -> None:

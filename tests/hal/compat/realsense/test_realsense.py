@@ -166,7 +166,7 @@ def test_the_right_imager_is_18_mm_to_the_right(twin: rs.TwinDevice) -> None:
     pipeline.stop()
 
 
-def test_exposure_and_gain_switch_auto_exposure_off_and_change_the_make_images(
+def test_exposure_and_gain_switch_auto_exposure_off_and_change_the_images(
     source: PlainSource, twin: rs.TwinDevice
 ) -> None:
     sensor = twin.handle.first_depth_sensor()
@@ -464,7 +464,7 @@ def test_a_hardware_reset_takes_it_off_the_bus_for_a_while(source: PlainSource, 
     pipeline.stop()
 
 
-def test_once_unplugged_a_twin_is_gone_for_good(source: PlainSource) -> None:
+def test_an_unplugged_twin_does_not_return(source: PlainSource) -> None:
     pipeline = rs.pipeline()
     with rs.plugged(source):
         pipeline.start(make_config())
