@@ -7,9 +7,9 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 
 from hal.base.d405 import FrameSource
-from hal.compat.masquerade import masquerade_module
 from hal.compat.realsense.device import SERIAL, TwinDevice
 from hal.compat.realsense.library import native as rs
+from hal.masquerade import masquerade_module
 
 _twins: list[TwinDevice] = []
 _watchers: list[Callable] = []

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from contextlib import AbstractContextManager
 
-from hal.compat.masquerade import install_module, masquerade_module
+from hal.masquerade import install_module, masquerade_module
 
 _NAME = "unitree_arm_interface"
 _OURS = f"hal.compat.{_NAME}"
