@@ -52,15 +52,16 @@ LABELS = {
 for _constant in (KP_LOWCMD, KD_LOWCMD, KP_JOINTCTRL, KD_JOINTCTRL, KD_PASSIVE, *LABELS.values()):
     _constant.setflags(write=False)
 
+# Layouts as measured on the vendor's controller; all are packed and little-endian.
 _HEAD = b"\xfe\xff"
 _COMMAND_HEAD = struct.Struct("<2siB")
 _STATE_HEAD = struct.Struct("<2si")
 _POSE = struct.Struct("<6d")
-_TRAJECTORY = struct.Struct("<i12d3di")
+_TRAJECTORY = struct.Struct("<i12d3di")  # 128 of the 140 bytes; the rest is unused
 _BODY_SIZE = COMMAND_SIZE - _COMMAND_HEAD.size
 _JOINTS_AT = _STATE_HEAD.size
 _POSE_AT = _JOINTS_AT + z1.N_JOINTS * JOINT_STATE.itemsize
-_LABEL_SIZE = 10
+_LABEL_SIZE = 10  # `char name[10]`, without a terminating zero at full length
 _MAX_POSE = 1e2  # [rad, m]; far beyond any Z1, so that only garbage is rejected
 _STATES = frozenset(Fsm)
 

@@ -44,7 +44,7 @@ MOTORS = (8, 7)
 MOTOR_HEALTHY = 1
 """A motor's byte in the self-check."""
 
-_SELF_CHECK_ANSWER = 0x20
+_SELF_CHECK_ANSWER = 0x20  # followed by the number of motors and one byte each (measured)
 
 
 def encode_self_check(motors: Sequence[int]) -> bytes:

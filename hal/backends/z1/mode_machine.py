@@ -24,6 +24,7 @@ _REST_SPEED = 0.05
 _REST_WAIT_S = 0.2
 # Timeout of each step through PASSIVE [s]; the controller answers within 2 ms, and the arm sinks meanwhile.
 _ENTRY_S = 0.05
+# Ten answer periods a try, and five tries in case single datagrams are lost.
 _REFRESH_WAIT_S = 0.02
 _REFRESH_TRIES = 5
 

@@ -27,7 +27,7 @@ log = logging.getLogger(__name__)
 _LOG_PERIOD_S = 1.0  # of repeated errors of the loop
 _CARTESIAN_TIMEOUT_S = 0.5  # a script that ends must not leave the arm moving
 _GRIPPER_SPEED = 1.0
-_MAX_ORIENTATION_SPEED, _MAX_POSITION_SPEED = 0.6, 0.3
+_MAX_ORIENTATION_SPEED, _MAX_POSITION_SPEED = 0.6, 0.3  # [rad/s], [m/s]
 _MAX_LINEAR_SPEED = 1.0
 
 
