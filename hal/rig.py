@@ -37,6 +37,6 @@ RIGS: Registry[Rig] = Registry(
         "mock": "hal.backends.mock_arm:make_rig",
         "real": "hal.backends.real_rig:make_rig",
         "sim": "sim_twin.backends:make_rig",
-        "wire-sim": "sim_twin.drop_in.rig:make_wire_rig",
+        "wire-sim": "sim_twin.drop_in.rig:make_wire_sim_rig",
     },
 )

@@ -1,4 +1,4 @@
-"""An arm made of arithmetic: follows its setpoints with a lag, and breaks on request."""
+"""Mock arm: it follows its setpoints with a lag, and fails on request."""
 
 from __future__ import annotations
 
@@ -13,25 +13,25 @@ from hal.base.z1 import KP, N_JOINTS, Q_HOME, Q_MAX, Q_MIN, TAU_MAX
 from hal.rig import Rig
 
 STALE_S = 0.1
-"""A measurement older than this is refused [s]."""
+"""Maximum age of a measurement [s]."""
 
 
 class MockArm:
-    """Six joints and a gripper that follow first-order, for tests and for trying things without a robot.
+    """Six joints and a gripper with a first-order response, for tests and trials without a robot.
 
     Torque is the lag times the Z1's stiffness, as in its position servo.
 
     Args:
-        clock: by which it moves; None = the wall's.
+        clock: source of time; None = wall clock.
         q: (7,) pose before the first setpoint [rad]; None = home with the jaws closed.
-        time_constant_s: of the following [s]; 0 follows at once.
+        time_constant_s: time constant of the response [s]; 0 = immediate.
     """
 
     def __init__(
         self, clock: Clock | None = None, *, q: np.ndarray | None = None, time_constant_s: float = 0.01
     ) -> None:
         self.clock = clock or WallClock()
-        self._tau_s = time_constant_s
+        self._time_constant_s = time_constant_s
         self._q = np.append(Q_HOME, 0.0) if q is None else np.array(q, dtype=float)
         self._dq = np.zeros(N_JOINTS)
         self._target = self._q.copy()
@@ -41,11 +41,11 @@ class MockArm:
         self._frozen: ArmState | None = None
         self._blocked_q: np.ndarray | None = None
         self.drop_commands = False
-        """Setpoints are lost on the way while this is set."""
-        self.refuse_commands = False
-        """Setpoints are refused while this is set."""
+        """Setpoints are lost while this is set."""
+        self.reject_commands = False
+        """Setpoints are rejected while this is set."""
         self.offset = np.zeros(N_JOINTS)
-        """(7,) constant following error: it settles at setpoint + offset [rad]."""
+        """(7,) constant following error: the arm settles at setpoint + offset [rad]."""
 
     def connect(self) -> None:
         self._connected = True
@@ -62,7 +62,8 @@ class MockArm:
             age_s = now_s - self._frozen.stamp_s
             if age_s > STALE_S:
                 raise HalTimeoutError(
-                    f"the mock arm's newest measurement is {age_s:.3f} s old; allowed is {STALE_S} s."
+                    f"mock arm: the newest measurement is {age_s:.3f} s old; allowed is {STALE_S} s. Call thaw().",
+                    code="stale_state",
                 )
             return self._frozen
         tau = np.clip(KP * (self._target - self._q), -TAU_MAX, TAU_MAX)
@@ -70,8 +71,8 @@ class MockArm:
 
     def send(self, setpoint: ArmSetpoint) -> ArmSetpoint:
         self._check_connected()
-        if self.refuse_commands:
-            raise CommandRejectedError("the mock arm refuses commands, as it was told to.")
+        if self.reject_commands:
+            raise CommandRejectedError("mock arm: commands are rejected; unset `reject_commands`.")
         self._move(self.clock.now_s())
         q = np.clip(setpoint.q, Q_MIN, Q_MAX)
         if not self.drop_commands:
@@ -83,22 +84,22 @@ class MockArm:
             self._move(self.clock.now_s())
             self._target = self._q.copy()
 
-    # --- Faults on request ------------------------------------------------------------------------------------
+    # --- Fault injection ------------------------------------------------------------------------------------
 
-    def inject_fault(self, *words: str) -> None:
+    def inject_fault(self, *faults: str) -> None:
         """Report these faults from now on, for instance "overheat joint 2"; none clears them."""
-        self._faults = words
+        self._faults = faults
 
     def freeze(self) -> None:
-        """Deliver no new measurement from now on; the arm itself goes on."""
+        """Deliver no new measurement from now on; the arm itself moves on."""
         self._frozen = self.read_state()
 
     def thaw(self) -> None:
-        """Undo `freeze`."""
+        """Deliver new measurements again, after `freeze`."""
         self._frozen = None
 
     def block(self, joint: int | None) -> None:
-        """Keep this joint (0…6) where it is, whatever is sent; None lets all go."""
+        """Block this joint (0…6) against all commands; None releases it."""
         self._blocked_q = None
         if joint is not None:
             self._blocked_q = np.full(N_JOINTS, np.nan)
@@ -112,8 +113,8 @@ class MockArm:
         dt_s = now_s - self._moved_s
         if dt_s <= 0:
             return
-        share = 1.0 if self._tau_s <= 0 else -np.expm1(-dt_s / self._tau_s)
-        q = self._q + share * (self._target + self.offset - self._q)
+        response = 1.0 if self._time_constant_s <= 0 else -np.expm1(-dt_s / self._time_constant_s)
+        q = self._q + response * (self._target + self.offset - self._q)
         if self._blocked_q is not None:
             q = np.where(np.isnan(self._blocked_q), q, self._blocked_q)
         self._dq = (q - self._q) / dt_s
@@ -121,7 +122,7 @@ class MockArm:
 
 
 def make_rig(**_: Any) -> Rig:
-    """Return a rig of a mock arm and the built-in recording, on the wall clock; options are for other rigs."""
+    """Return a rig of a mock arm and the built-in recording, on the wall clock; other options are ignored."""
     from hal.backends.replay_camera import ReplayCamera
 
     clock = WallClock()

@@ -1,4 +1,4 @@
-"""The real robot: the Z1 behind the vendor's controller, and the D405 on its wrist."""
+"""Rig of the real robot: the Z1 behind the vendor's controller, and the D405 on its wrist."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from hal.rig import Rig
 from hal.z1_protocol.controller import LABELS
 
 SEARCH_S = 1.0
-"""How long arm and camera are looked for: whoever has neither knows it 3 s after he has asked [s]."""
+"""Search time for arm and camera [s]; short, so that a machine with neither reports both within 3 s."""
 
 
 def make_rig(*, arm: Z1ArmConfig | None = None, camera: Any = None, **_: Any) -> Rig:
     """Return the rig of the real robot, on the wall clock.
 
     Args:
-        arm: where the controller is and how to use it.
-        camera: a `hal.backends.d405.camera.D405CameraConfig`.
+        arm: configuration of the arm.
+        camera: a `hal.backends.d405.session.D405CameraConfig`.
         **_: options of other rigs.
     """
     clock = WallClock()

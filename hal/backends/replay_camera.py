@@ -1,4 +1,4 @@
-"""A camera that plays recorded frames, and the file they are recorded in."""
+"""Camera that replays recorded frames, and the format of their file."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from hal.base.clock import Clock, WallClock
 from hal.base.errors import CameraError, HalTimeoutError, NotConnectedError
 from hal.base.messages import Intrinsics, RgbdFrame
 
-_PERIOD_S = 1 / 30
+_PERIOD_S = 1 / 30  # of the D405's default rate
 
 
 class ReplayCamera:
-    """Plays frames at the rate they were recorded at, with new stamps and sequence numbers.
+    """Replay of frames at their recorded rate, with new stamps and sequence numbers.
 
     Args:
-        frames: what to play; None = from `path`, or else the built-in scene.
+        frames: frames to replay; None = from `path`, or else the built-in scene.
         path: a file of `save_frames`.
-        clock: by which it plays; None = the wall's.
-        loop: start again after the last frame, else `wait_for_frame` times out there.
+        clock: source of time; None = wall clock.
+        loop: start again after the last frame; else `wait_for_frame` times out there.
 
     Raises:
-        CameraError: there is nothing to play, or the frames are not of one camera.
+        CameraError: no frames, or frames of several cameras.
     """
 
     def __init__(
@@ -39,9 +39,14 @@ class ReplayCamera:
         if frames is None:
             frames = load_frames(path) if path is not None else make_demo_frames()
         if not frames:
-            raise CameraError("there is no frame to play; record at least one with save_frames().")
+            raise CameraError(
+                "replay camera: no frames to replay; record at least one with save_frames().", code="no_frames"
+            )
         if any(frame.intrinsics != frames[0].intrinsics for frame in frames):
-            raise CameraError("the frames to play have different intrinsics; record one camera at a time.")
+            raise CameraError(
+                "replay camera: the frames have different intrinsics; record one camera at a time.",
+                code="mixed_cameras",
+            )
         self._frames = list(frames)
         self._clock = clock or WallClock()
         self._loop = loop
@@ -63,25 +68,28 @@ class ReplayCamera:
 
     @property
     def intrinsics(self) -> Intrinsics:
-        self._started()
+        self._require_start()
         return self._frames[0].intrinsics
 
     def wait_for_frame(self, timeout_s: float) -> RgbdFrame:
-        start_s = self._started()
+        start_s = self._require_start()
         now_s = self._clock.now_s()
         sequence = max(self._next_after(now_s - start_s), self._last + 1)
         loops, index = divmod(sequence, len(self._frames))
         due_s = start_s + loops * self._length_s + float(self._due_s[index])
-        over = not self._loop and loops > 0
-        if over or due_s > now_s + timeout_s:
+        ended = not self._loop and loops > 0
+        if ended or due_s > now_s + timeout_s:
             self._clock.sleep_until(now_s + timeout_s)
-            why = "the recording has ended" if over else f"the next is due in {due_s - now_s:.3f} s"
-            raise HalTimeoutError(f"no frame within {timeout_s} s: {why}.")
+            reason = "the recording has ended" if ended else f"the next one is due in {due_s - now_s:.3f} s"
+            raise HalTimeoutError(
+                f"replay camera: no frame within {timeout_s} s: {reason}.",
+                code="recording_ended" if ended else "no_frame",
+            )
         self._clock.sleep_until(due_s)
         self._last = sequence
         return replace(self._frames[index], stamp_s=due_s, sequence=sequence)
 
-    def _started(self) -> float:
+    def _require_start(self) -> float:
         if self._start_s is None:
             raise NotConnectedError("the replay camera")
         return self._start_s
@@ -96,10 +104,13 @@ def save_frames(path: str | Path, frames: Sequence[RgbdFrame]) -> None:
     """Write frames of one camera into a compressed `.npz`.
 
     Raises:
-        CameraError: there is none, or they are not of one camera.
+        CameraError: no frames, or frames of several cameras.
     """
     if not frames or any(_device(frame) != _device(frames[0]) for frame in frames):
-        raise CameraError("save_frames() takes at least one frame, all of one camera and the same intrinsics.")
+        raise CameraError(
+            "replay camera: save_frames() takes at least one frame, all of one camera and the same intrinsics.",
+            code="mixed_cameras" if frames else "no_frames",
+        )
     arrays = {
         "colour": np.stack([frame.colour for frame in frames]),
         "depth_m": np.stack([frame.depth_m for frame in frames]),
@@ -120,11 +131,11 @@ def _device(frame: RgbdFrame) -> tuple[Intrinsics, str]:
 
 
 def load_frames(path: str | Path) -> list[RgbdFrame]:
-    """Read what `save_frames` wrote.
+    """Return the frames in a file of `save_frames`.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        CameraError: it holds no frames.
+        FileNotFoundError: no such file.
+        CameraError: the file holds no frames.
     """
     try:
         with np.load(Path(path), allow_pickle=False) as data:
@@ -135,7 +146,7 @@ def load_frames(path: str | Path) -> list[RgbdFrame]:
             **{name: float(arrays[f"intrinsics_{name}"]) for name in ("fx", "fy", "cx", "cy")},
         )
         masks = arrays.get("ground_truth_mask")
-        serial = str(arrays.get("serial", ""))  # recordings of before it was known
+        serial = str(arrays.get("serial", ""))  # older recordings have none
         return [
             RgbdFrame(
                 colour=colour,
@@ -149,14 +160,16 @@ def load_frames(path: str | Path) -> list[RgbdFrame]:
             for i, colour in enumerate(arrays["colour"])
         ]
     except (KeyError, ValueError, AttributeError) as error:
-        raise CameraError(f"{path} holds no recorded frames ({error}); write it with save_frames().") from error
+        raise CameraError(
+            f"replay camera: {path} holds no recorded frames ({error}); write it with save_frames().",
+            code="not_a_recording",
+        ) from error
 
 
 def make_demo_frames(n: int = 4) -> list[RgbdFrame]:
     """Return `n` small frames of a ball above a plane, moving sideways, by ray casting."""
     intrinsics = Intrinsics(width=64, height=48, fx=60.0, fy=60.0, cx=31.5, cy=23.5)
-    rows, columns = np.mgrid[0:48, 0:64]
-    rays = np.dstack([(columns - 31.5) / 60.0, (rows - 23.5) / 60.0, np.ones((48, 64))])
+    rays = intrinsics.rays()
     frames = []
     for i in range(n):
         centre = np.array([0.02 * (i - (n - 1) / 2), 0.0, 0.35])

@@ -166,7 +166,7 @@ class FrameSource(Protocol):
         """False while the cable is out."""
         ...
 
-    def expose(self, request: CaptureRequest, /) -> Exposure | None:
+    def expose(self, request: CaptureRequest) -> Exposure | None:
         """Return the images of this moment; None = the camera hangs and delivers nothing."""
         ...
 

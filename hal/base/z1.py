@@ -1,4 +1,4 @@
-"""Facts of the Unitree Z1, its beak gripper and our wrist mount, each with its source.
+"""Facts of the Unitree Z1, its gripper and our wrist mount, each with its source.
 
 "URDF" is `z1_description` of the `example-robot-data` wheel; "wire" is the vendor's wire protocol as measured.
 Tests hold the URDF, the twin and this page to the same numbers.
@@ -40,7 +40,7 @@ DQ_MAX = _constant(3.1415, 3.1415, 3.1415, 3.1415, 3.1415, 3.1415, 3.1415)
 TAU_MAX = _constant(30.0, 60.0, 30.0, 30.0, 30.0, 30.0, 30.0)
 """(7,) highest motor torque [Nm]; joint 2 has two motors."""
 
-# --- Not published by the vendor; chosen by us so that the twin tracks within 0.02 rad --------------------
+# --- Not published by the vendor; chosen so that the twin tracks within 0.02 rad --------------------
 DDQ_MAX = _constant(8.0, 8.0, 8.0, 12.0, 12.0, 12.0, 12.0)
 """(7,) highest joint acceleration [rad/s²]."""
 DDDQ_MAX = _constant(80.0, 80.0, 80.0, 120.0, 120.0, 120.0, 120.0)
@@ -59,15 +59,15 @@ CONTROL_PERIOD_S = 0.002
 
 # --- Poses --------------------------------------------------------------------------------------------------
 Q_HOME = _constant(0.0, 1.085, -0.261, -0.523, 0.0, 1.57)
-"""(6,) where the arm looks from (the paper's home) [rad]."""
+"""(6,) home, the camera's viewpoint in the paper [rad]."""
 
-# --- Gripper: a beak. The stator is one jaw, the mover turns about the pivot's y axis ------------------------
+# --- Gripper: a stationary jaw, and a moving jaw that turns about the pivot's y axis --------------------------
 GRIPPER_OPEN = -1.5707
-"""Mover angle of the widest opening [rad] (URDF)."""
+"""Jaw angle of the maximum opening [rad] (URDF)."""
 GRIPPER_CLOSED = 0.0
-"""Mover angle when the jaws touch [rad] (URDF)."""
+"""Jaw angle at which the jaws touch [rad] (URDF)."""
 T_FLANGE_PIVOT = np.array([[1.0, 0, 0, 0.100], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
-"""(4, 4) the mover's axis, the vendor's end-effector: 0.051 + 0.049 m along link06's x (URDF; wire pose)."""
+"""(4, 4) axis of the moving jaw, the vendor's end effector: 0.051 + 0.049 m along link06's x (URDF; measured pose)."""
 T_FLANGE_PIVOT.setflags(write=False)
 
 # --- Our wrist mount -------------------------------------------------------------------------------------------
@@ -90,8 +90,8 @@ def _mount(along_m: float, above_m: float, tilt_rad: float) -> np.ndarray:
 T_FLANGE_CAMERA = _mount(along_m=0.07, above_m=0.14, tilt_rad=0.55)
 """(4, 4) nominal hand-eye transform of the mount's drawing; a calibration result replaces it on a real arm.
 
-Measured on the ten hardest of the 81 scenario views: none touches the border of the image, and the jaws hide at most
-23 % of the object (0.06 m, 0.10 m and 0.4 rad hide 65 %).
+Measured on the ten hardest of the 81 scenario views: none touches the border of the image, and the jaws occlude at
+most 23 % of the object (0.06 m, 0.10 m and 0.4 rad occlude 65 %).
 """
 
 
@@ -101,12 +101,12 @@ of its middle and 3.7 mm behind its front glass)."""
 CAMERA_HOUSING_HIGH = _constant(0.030, 0.021, 0.0037)
 """(3,) upper corner of the same [m]."""
 BRACKET_FOOT = _constant(0.020, 0.030, 0.009)
-"""(3,) where the bracket, a plate, stands on the flange's skin (radius 32.5 mm), flange frame [m]."""
+"""(3,) foot of the bracket, a plate, on the flange's surface (radius 32.5 mm), flange frame [m]."""
 BRACKET_HEAD = T_FLANGE_CAMERA[:3, :3] @ np.array([0.009, 0.0, -0.0220]) + T_FLANGE_CAMERA[:3, 3]
-"""(3,) where it meets the housing's back, flange frame [m]."""
+"""(3,) head of the bracket, at the housing's back, flange frame [m]."""
 BRACKET_HEAD.setflags(write=False)
 BRACKET_HALF_WIDTH_M = 0.015
-"""Half its width, along the flange's z [m]."""
+"""Half the bracket's width, along the flange's z [m]."""
 
 
 @cache

@@ -1,7 +1,7 @@
 """The Z1's gripper in the plane in which it closes, in the pivot frame: x towards the tips, y along the jaw's axis.
 
-The gripper is a beak: the stationary jaw, fixed to the flange, lies below (−z), the moving jaw turns about the pivot's
-y axis. Both were measured from the collision meshes (STL) of the Z1's description; a test holds them together.
+The gripper is a beak: the stationary jaw is fixed to the flange, below (−z), and the moving jaw turns about the pivot's
+y axis. Both were measured from the collision meshes (STL) of the Z1's description; a test compares them.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ PAD_HALF_WIDTH_M = 0.026
 JAW_REACH_M = 0.100
 """Distance of the fingertips from the pivot [m]."""
 WRIST_X_M, WRIST_HALF_M = (-0.100, -0.030), 0.030
-"""x range, and half the height and width, of what is behind the palm [m]."""
+"""x range, and half the height and width, of the wrist behind the palm [m]."""
 T_PIVOT_STATIONARY_JAW = np.eye(4)
 """(4, 4) the stationary jaw's mesh in the pivot frame: the moving jaw's joint on the gripper's body (URDF)."""
 T_PIVOT_STATIONARY_JAW[0, 3] = -0.049

@@ -1,4 +1,4 @@
-"""The Z1's rigid-body model, read once from its URDF by pinocchio, and the forward kinematics on it."""
+"""Rigid-body model of the Z1, loaded once from its URDF by pinocchio, and its forward kinematics."""
 
 from __future__ import annotations
 

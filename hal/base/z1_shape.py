@@ -1,4 +1,4 @@
-"""The Z1's shape, coarse enough to be checked at 500 Hz: capsules for the links, points for what the wrist carries."""
+"""Shape of the Z1, coarse enough for 500 Hz checks: capsules for the links, points for gripper and camera."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ CAPSULES = (
     Capsule("link04", (0.0, 0.0, 0.0), (0.070, 0.0, 0.0), 0.040),
     Capsule("link05", (0.0, 0.0, 0.0), (0.030, 0.0, 0.0), 0.040),
 )
-"""Fitted to the collision meshes; no mesh point sticks out further than 10 mm (a test measures it)."""
+"""Fitted to the collision meshes; mesh points protrude by at most 10 mm (a test measures it)."""
 
 _MEET = {
     "link03": ("link00", "link01"),
@@ -45,12 +45,12 @@ CAPSULE_PAIRS = np.array(
         if other.link in _MEET.get(one.link, ())
     ]
 )
-"""(P, 2) which capsules can meet, as indices of `CAPSULES`; neighbours on the chain always touch."""
+"""(P, 2) indices of the capsules that can meet; neighbours on the chain always touch."""
 CAPSULE_PAIRS.setflags(write=False)
 TABLE_LINKS = ("link02", "link03", "link04", "link05")
-"""Links that move about enough to meet the table."""
+"""Links that can reach the table."""
 GRIPPER_OBSTACLES = ("link00", "link01", "link02", "link03")
-"""Links that gripper and camera can meet."""
+"""Links that gripper and camera can reach."""
 
 
 def _edges(*outline: tuple[float, float, float]) -> np.ndarray:
@@ -58,7 +58,7 @@ def _edges(*outline: tuple[float, float, float]) -> np.ndarray:
     return np.array([(x, side * y, z) for x, z, y in outline for side in (-1.0, 1.0)])
 
 
-def _hand_points() -> np.ndarray:
+def _gripper_points() -> np.ndarray:
     tip, palm = [(0.100, -0.009, 0.031), (0.095, -0.024, 0.031)], [(0.0, -0.036, 0.041), (0.0, 0.033, 0.041)]
     jaw = _edges(*tip, (0.070, -0.034, 0.037), *palm)
     T_pivot_camera = np.linalg.inv(z1.T_FLANGE_PIVOT) @ z1.T_FLANGE_CAMERA
@@ -68,7 +68,7 @@ def _hand_points() -> np.ndarray:
     return points
 
 
-GRIPPER_POINTS = _hand_points()
+GRIPPER_POINTS = _gripper_points()
 """(18, 3) corners of fixed jaw and camera housing, in the pivot frame [m] (STL meshes, `hal.base.z1`)."""
 MOVING_JAW_POINTS = _edges((0.100, -0.009, 0.031), (0.100, 0.008, 0.031), (0.080, 0.020, 0.036), (0.040, 0.026, 0.041))
 """(8, 3) corners of the moving jaw, in the pivot frame when it is closed [m] (STL mesh)."""

@@ -1,7 +1,7 @@
-"""Client ↔ z1_ctrl: commands of 147 B to port 8071, states of 208 B back to port 8072.
+"""Protocol of client ↔ z1_ctrl: commands of 147 B to port 8071, states of 208 B back to port 8072.
 
-What the last 140 bytes of a command mean depends on the state that is asked for or, while tracking, on the one the
-controller is in; `Command.joints`, `.trajectory` and `.label` read them when that is known.
+The meaning of the last 140 bytes of a command depends on the requested state or, while tracking, on the present one;
+`Command.joints`, `.trajectory` and `.label` decode them once it is known.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ COMMAND_SIZE = 147
 STATE_SIZE = 208
 
 KP_LOWCMD = np.array([20.0, 30.0, 30.0, 20.0, 15.0, 10.0, 20.0])
-"""(7,) the client's usual gains in LOWCMD, in wire units."""
+"""(7,) the client's default gains in LOWCMD, in wire units."""
 KD_LOWCMD = np.full(z1.N_JOINTS, 2000.0)
-"""(7,) the client's usual damping gains in LOWCMD, in wire units."""
+"""(7,) the client's default damping gains in LOWCMD, in wire units."""
 KP_JOINTCTRL = z1.KP / KP_SCALE
 """(7,) the controller's gains in JOINTCTRL, in wire units."""
 KD_JOINTCTRL = z1.KD / KD_SCALE
@@ -52,22 +52,23 @@ LABELS = {
 for _constant in (KP_LOWCMD, KD_LOWCMD, KP_JOINTCTRL, KD_JOINTCTRL, KD_PASSIVE, *LABELS.values()):
     _constant.setflags(write=False)
 
+# Layouts as measured on the vendor's controller; all are packed and little-endian.
 _HEAD = b"\xfe\xff"
 _COMMAND_HEAD = struct.Struct("<2siB")
 _STATE_HEAD = struct.Struct("<2si")
 _POSE = struct.Struct("<6d")
-_TRAJECTORY = struct.Struct("<i12d3di")
+_TRAJECTORY = struct.Struct("<i12d3di")  # 128 of the 140 bytes; the rest is unused
 _BODY_SIZE = COMMAND_SIZE - _COMMAND_HEAD.size
 _JOINTS_AT = _STATE_HEAD.size
 _POSE_AT = _JOINTS_AT + z1.N_JOINTS * JOINT_STATE.itemsize
-_LABEL_SIZE = 10
-_PLAUSIBLE_POSE = 1e2
+_LABEL_SIZE = 10  # `char name[10]`, without a terminating zero at full length
+_MAX_POSE = 1e2  # [rad, m]; far beyond any Z1, so that only garbage is rejected
 _STATES = frozenset(Fsm)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class TrajectoryCommand:
-    """A move of the gripper pivot: roll, pitch, yaw [rad] (R = Rz·Ry·Rx) and x, y, z [m] in the base frame."""
+    """Move of the gripper pivot: roll, pitch, yaw [rad] (R = Rz·Ry·Rx) and x, y, z [m] in the base frame."""
 
     kind: int = 0
     """Unused by the controller; may hold garbage."""
@@ -76,42 +77,43 @@ class TrajectoryCommand:
     gripper_rad: float = 0.0
     """Gripper angle at the end [rad]."""
     max_speed: float = 0.0
-    """Of the joints in MOVEJ [rad/s], of the pivot in MOVEL and MOVEC [m/s]."""
+    """Maximum speed of the joints in MOVEJ [rad/s], of the pivot in MOVEL and MOVEC [m/s]."""
     stop_time_s: float = 0.0
-    """[s]."""
+    """Stop time [s]; ignored by the twin."""
     order: int = 0
     """Number of this piece in SETTRAJ."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Command:
-    """A decoded command; its body is read when it is known what it means."""
+    """A decoded command; its body is decoded later, once its meaning is known."""
 
     state: Fsm
-    """The state asked for; INVALID keeps the present one."""
+    """Requested state; INVALID keeps the present one."""
     track: bool
-    """Whether the body is to be followed, in JOINTCTRL and CARTESIAN."""
+    """Whether the body is a tracking target, in JOINTCTRL and CARTESIAN."""
     body: bytes
     """140 bytes."""
 
     def joints(self) -> JointCommands:
-        """Read the body as seven joints' commands (LOWCMD, and tracking in JOINTCTRL).
+        """Decode the body as seven joints' commands (LOWCMD, and tracking in JOINTCTRL).
 
         Raises:
-            WireError: a value is not finite.
+            ProtocolError: a value is not finite.
         """
         return unpack_commands(np.frombuffer(self.body, JOINT_CMD))
 
     def trajectory(self) -> TrajectoryCommand:
-        """Read the body as a move (MOVEJ, MOVEL, MOVEC, SETTRAJ, and tracking in CARTESIAN).
+        """Decode the body as a move (MOVEJ, MOVEL, MOVEC, SETTRAJ, and tracking in CARTESIAN).
 
         Raises:
-            WireError: a value is not finite.
+            ProtocolError: a value is not finite.
         """
         kind, *numbers, order = _TRAJECTORY.unpack_from(self.body)
         values = np.array(numbers)
         if not np.isfinite(values).all():
-            raise ProtocolError(f"a move holds values that are not finite: {values[~np.isfinite(values)][:3]}.")
+            bad = values[~np.isfinite(values)][:3]
+            raise ProtocolError(f"a move holds values that are not finite: {bad}.", code="not_finite")
         return TrajectoryCommand(
             kind=kind,
             poses=values[:12].reshape(2, 6),
@@ -122,40 +124,42 @@ class Command:
         )
 
     def label(self) -> str:
-        """Read the body as a label (TOSTATE, SAVESTATE, TEACH, TEACHREPEAT).
+        """Decode the body as a label (TOSTATE, SAVESTATE, TEACH, TEACHREPEAT).
 
         Raises:
-            WireError: not 1 to 10 printable ASCII characters.
+            ProtocolError: not 1 to 10 printable ASCII characters.
         """
         name = self.body[:_LABEL_SIZE].split(b"\0", 1)[0]
         if not name or not all(0x20 < byte < 0x7F for byte in name):
-            raise ProtocolError(f"a label is {name!r}; allowed are 1 to {_LABEL_SIZE} printable ASCII characters.")
+            raise ProtocolError(
+                f"a label is {name!r}; allowed are 1 to {_LABEL_SIZE} printable ASCII characters.", code="label"
+            )
         return name.decode("ascii")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ControllerState:
-    """What the controller answers."""
+    """Answer of the controller."""
 
     state: Fsm
-    """What it is doing."""
+    """Present state."""
     joints: JointStates
-    """The seven joints; repeated unchanged while the arm board is silent."""
+    """The seven joints; repeated unchanged while the motor board is silent."""
     pose: np.ndarray
     """(6,) roll, pitch, yaw [rad] and x, y, z [m] of the gripper pivot in the base frame."""
 
 
 class CommandBuffer:
-    """One command that is written over and over, without making garbage; `data` is what to send."""
+    """One command in a buffer that is reused, so that the servo loop allocates nothing; `data` is sent."""
 
     def __init__(self) -> None:
         self.data = bytearray(COMMAND_SIZE)
         self.joints = np.frombuffer(self.data, JOINT_CMD, z1.N_JOINTS, offset=_COMMAND_HEAD.size)
         """Records (7,) of `JOINT_CMD` inside `data`: assign to them."""
-        self.head(Fsm.INVALID, track=False)
+        self.set_head(Fsm.INVALID, track=False)
 
-    def head(self, state: Fsm, *, track: bool) -> None:
-        """Set what is asked for, and whether the joints are to be tracked."""
+    def set_head(self, state: Fsm, *, track: bool) -> None:
+        """Set the requested state, and whether the joints are a tracking target."""
         _COMMAND_HEAD.pack_into(self.data, 0, _HEAD, state, track)
 
 
@@ -165,7 +169,7 @@ def encode_command(
     """Return a command of 147 B.
 
     Raises:
-        WireError: a value that is not finite, a label that is too long, not seven joints.
+        ProtocolError: a value that is not finite, a label that is too long, not seven joints.
     """
     match body:
         case None:
@@ -177,7 +181,7 @@ def encode_command(
         case TrajectoryCommand():
             packed = _pack_trajectory(body)
     if len(packed) > _BODY_SIZE:
-        raise ProtocolError(f"a command holds {len(packed)} bytes beside its head; allowed are {_BODY_SIZE}.")
+        raise ProtocolError(f"a command's body has {len(packed)} bytes; allowed are {_BODY_SIZE}.", code="wrong_size")
     return _COMMAND_HEAD.pack(_HEAD, state, track) + packed.ljust(_BODY_SIZE, b"\0")
 
 
@@ -185,13 +189,13 @@ def decode_command(data: bytes | memoryview) -> Command:
     """Return the command in a datagram.
 
     Raises:
-        WireError: wrong size, head, state or flag.
+        ProtocolError: wrong size, head, state or flag.
     """
     _check_size(data, COMMAND_SIZE, "a command")
     head, state, track = _COMMAND_HEAD.unpack_from(data)
     _check_head(head, state)
     if track > 1:
-        raise ProtocolError(f"a command's track flag is {track}; allowed are 0 and 1.")
+        raise ProtocolError(f"a command's track flag is {track}; allowed are 0 and 1.", code="track_flag")
     return Command(state=Fsm(state), track=bool(track), body=bytes(data[_COMMAND_HEAD.size :]))
 
 
@@ -199,10 +203,10 @@ def encode_state(state: ControllerState) -> bytes:
     """Return a state of 208 B.
 
     Raises:
-        WireError: a value that is not finite, or not seven joints.
+        ProtocolError: a value that is not finite, or not seven joints.
     """
     if not np.isfinite(state.pose).all():
-        raise ProtocolError(f"the pose {state.pose} must be finite.")
+        raise ProtocolError(f"the pose is {state.pose}; it must be finite.", code="not_finite")
     joints = pack_states(state.joints).tobytes()
     data = _STATE_HEAD.pack(_HEAD, state.state) + joints + _POSE.pack(*state.pose)
     _check_size(data, STATE_SIZE, "a state")
@@ -213,14 +217,16 @@ def decode_state(data: bytes | memoryview) -> ControllerState:
     """Return the state in a datagram, which is copied.
 
     Raises:
-        WireError: wrong size, head or state, or a value that no Z1 can have.
+        ProtocolError: wrong size, head or state, or a value that no Z1 can have.
     """
     _check_size(data, STATE_SIZE, "a state")
     head, state = _STATE_HEAD.unpack_from(data)
     _check_head(head, state)
     pose = np.array(_POSE.unpack_from(data, _POSE_AT))
-    if not (np.abs(pose) <= _PLAUSIBLE_POSE).all():
-        raise ProtocolError(f"the gripper's pose is {pose}; allowed are finite values within ±{_PLAUSIBLE_POSE:g}.")
+    if not (np.abs(pose) <= _MAX_POSE).all():
+        raise ProtocolError(
+            f"the gripper's pose is {pose}; allowed are finite values within ±{_MAX_POSE:g}.", code="implausible_value"
+        )
     records = np.frombuffer(bytes(data[_JOINTS_AT:_POSE_AT]), JOINT_STATE)
     return ControllerState(state=Fsm(state), joints=unpack_states(records), pose=pose)
 
@@ -229,7 +235,8 @@ def _pack_label(label: str) -> bytes:
     packed = label.encode("ascii", "replace")
     if not 1 <= len(packed) <= _LABEL_SIZE or not label.isascii() or not label.isprintable() or " " in label:
         raise ProtocolError(
-            f"the label {label!r} cannot be sent; allowed are 1 to {_LABEL_SIZE} printable ASCII characters."
+            f"the label {label!r} cannot be sent; allowed are 1 to {_LABEL_SIZE} printable ASCII characters.",
+            code="label",
         )
     return packed
 
@@ -237,17 +244,17 @@ def _pack_label(label: str) -> bytes:
 def _pack_trajectory(move: TrajectoryCommand) -> bytes:
     numbers = [*np.asarray(move.poses, dtype=float).ravel(), move.gripper_rad, move.max_speed, move.stop_time_s]
     if not np.isfinite(numbers).all():
-        raise ProtocolError(f"a move holds values that are not finite: {numbers}.")
+        raise ProtocolError(f"a move holds values that are not finite: {numbers}.", code="not_finite")
     return _TRAJECTORY.pack(move.kind, *numbers, move.order)
 
 
-def _check_size(data: bytes | memoryview, size: int, what: str) -> None:
+def _check_size(data: bytes | memoryview, size: int, name: str) -> None:
     if len(data) != size:
-        raise ProtocolError(f"{what} has {len(data)} bytes; allowed are {size}.")
+        raise ProtocolError(f"{name} has {len(data)} bytes; allowed are {size}.", code="wrong_size")
 
 
 def _check_head(head: bytes, state: int) -> None:
     if head != _HEAD:
-        raise ProtocolError(f"a datagram begins with {head.hex()}; allowed is {_HEAD.hex()}.")
+        raise ProtocolError(f"a datagram begins with {head.hex()}; allowed is {_HEAD.hex()}.", code="wrong_head")
     if state not in _STATES:
-        raise ProtocolError(f"a datagram names state {state}; allowed are 0 to {max(_STATES)}.")
+        raise ProtocolError(f"a datagram has state {state}; allowed are 0 to {max(_STATES)}.", code="unknown_state")

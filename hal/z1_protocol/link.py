@@ -1,4 +1,4 @@
-"""How datagrams get to the other side of a wire and back: over UDP, or by whatever else keeps this contract."""
+"""Datagram links to one peer: the contract, and its implementation over UDP."""
 
 from __future__ import annotations
 
@@ -9,23 +9,23 @@ from typing import Protocol
 
 from hal.base.errors import HalError, LeaseError
 
-_LARGEST = 2048
+_MAX_DATAGRAM = 2048  # ten times the largest valid one; longer ones are cut and then have a wrong size
 
 
 class DatagramLink(Protocol):
-    """Datagrams to one peer and from it."""
+    """Exchange of datagrams with one peer."""
 
     def open(self) -> None:
-        """Take the local port.
+        """Bind the local port.
 
         Raises:
             LeaseError: another process has it.
-            HalError: there is no such address here.
+            HalError: no such address on this machine.
         """
         ...
 
     def close(self) -> None:
-        """Give the port back. Harmless when not open."""
+        """Release the port. Harmless when not open."""
         ...
 
     def send(self, data: bytes | bytearray) -> bool:
@@ -38,12 +38,12 @@ class DatagramLink(Protocol):
         ...
 
     def describe(self) -> str:
-        """Say who the peer is and what is known about the way to it."""
+        """Return the peer's address and the last failure of the link, as text."""
         ...
 
 
 class UdpLink:
-    """A socket that hears its peer alone: the kernel drops what anybody else sends.
+    """A UDP socket connected to its peer: the kernel drops the datagrams of all others.
 
     Args:
         remote: address and port of the peer.
@@ -55,22 +55,22 @@ class UdpLink:
         self._local = local
         self._socket: socket.socket | None = None
         self._poll = select.poll()
-        self._buffer = memoryview(bytearray(_LARGEST))
-        self._trouble = ""
+        self._buffer = memoryview(bytearray(_MAX_DATAGRAM))
+        self._failure = ""
 
     def open(self) -> None:
         if self._socket is not None:
             return
-        made = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
-            made.setblocking(False)
-            made.bind(self._local)
-            made.connect(self._remote)
+            opened.setblocking(False)
+            opened.bind(self._local)
+            opened.connect(self._remote)
         except OSError as error:
-            made.close()
+            opened.close()
             raise self._explain(error) from error
-        self._socket, self._trouble = made, ""
-        self._poll.register(made, select.POLLIN)
+        self._socket, self._failure = opened, ""
+        self._poll.register(opened, select.POLLIN)
 
     def close(self) -> None:
         if self._socket is not None:
@@ -83,8 +83,8 @@ class UdpLink:
             return False
         try:
             return self._socket.send(data) == len(data)
-        except OSError as error:  # the way is closed for now; what comes of it is for the peer's silence to show
-            self._note(error)
+        except OSError as error:  # often passing, as while the peer restarts; its silence shows what lasts
+            self._record(error)
             return False
 
     def receive(self, timeout_s: float = 0.0) -> memoryview | None:
@@ -93,32 +93,33 @@ class UdpLink:
         try:
             if timeout_s > 0.0 and not self._poll.poll(1e3 * timeout_s):
                 return None
-            # One that is longer than the buffer is cut, and its size still wrong.
             return self._buffer[: self._socket.recv_into(self._buffer)]
         except BlockingIOError:
             return None
         except OSError as error:
-            self._note(error)
+            self._record(error)
             return None
 
     def describe(self) -> str:
-        return f"{_join(self._remote)} (answers to {_join(self._local)}){self._trouble}"
+        return f"{_join(self._remote)} (answers to {_join(self._local)}){self._failure}"
 
-    def _note(self, error: OSError) -> None:
+    def _record(self, error: OSError) -> None:
         if error.errno == errno.ECONNREFUSED:
-            self._trouble = "; the machine answers that nothing listens on that port"
+            self._failure = "; that machine reports that nothing listens on the port"
         else:
-            self._trouble = f"; the system says: {error.strerror}"
+            self._failure = f"; the system reports: {error.strerror}"
 
     def _explain(self, error: OSError) -> HalError:
         if error.errno == errno.EADDRINUSE:
             return LeaseError(
-                f"port {_join(self._local)} is taken: another program talks to this controller already. End it first "
-                f"(`ss -lunp 'sport = :{self._local[1]}'` names it), or give both sides another pair of ports."
+                f"Z1: port {_join(self._local)} is in use: another program talks to this controller. End it first "
+                f"(`ss -lunp 'sport = :{self._local[1]}'` names it), or give both sides another pair of ports.",
+                code="port_in_use",
             )
         return HalError(
-            f"cannot talk from {_join(self._local)} to {_join(self._remote)}: {error.strerror or error}. Give the "
-            f"controller's address as this machine reaches it, and a local address that is this machine's."
+            f"Z1: no link from {_join(self._local)} to {_join(self._remote)}: {error.strerror or error}. Give the "
+            f"controller's address as this machine reaches it, and a local address of this machine.",
+            code="address_unavailable",
         )
 
 

@@ -1,7 +1,7 @@
-"""What both of the Z1's wire protocols are made of: the packed records of a joint, and how they are checked.
+"""Packed joint records of both of the Z1's wire protocols, and their validation.
 
 Everything is little-endian and unpadded. The sizes were measured on the vendor's own programs; a test asserts them.
-Decoders take whatever a socket delivers: anything malformed is a `ProtocolError`, which the loops count and drop.
+Decoders accept any bytes: malformed ones raise a `ProtocolError`, which the loops count and drop.
 """
 
 from __future__ import annotations
@@ -15,26 +15,28 @@ from hal.base import z1
 from hal.base.errors import HalError
 
 JOINT_CMD = np.dtype([("tau", "<f4"), ("dq", "<f4"), ("q", "<f4"), ("kp", "<f4"), ("kd", "<f4")])
-"""20 B, what a joint is told: torque [Nm], speed [rad/s], position [rad], gain and damping gain in wire units."""
+"""20 B, command of a joint: torque [Nm], speed [rad/s], position [rad], gain and damping gain in wire units."""
 MOTOR = np.dtype([("temperature", "i1"), ("error", "u1"), ("link", "u1")])
 """3 B, a motor's record: temperature [°C], `MotorError` bits, and `MotorLink` in the top two bits."""
 JOINT_STATE = np.dtype([("tau", "<f4"), ("dq", "<f4"), ("ddq", "<f4"), ("q", "<f4"), ("motors", MOTOR, (2,))])
-"""22 B, what a joint measures, and its motors: only joint 2 has a second one."""
+"""22 B, measurement of a joint and its motors: only joint 2 has a second one."""
 JOINT_STATE_OLD = np.dtype([("tau", "<f4"), ("dq", "<f4"), ("ddq", "<f4"), ("q", "<f4")])
 """16 B, the same in the old format, without motor records."""
 
 KP_SCALE = 25.6
-"""Stiffness at the motor per unit of `kp` on the wire [Nm/rad] (wire)."""
+"""Stiffness at the motor per unit of `kp` on the wire [Nm/rad] (measured on the vendor's controller)."""
 KD_SCALE = 0.0128
-"""Damping at the motor per unit of `kd` on the wire [Nm s/rad] (wire)."""
+"""Damping at the motor per unit of `kd` on the wire [Nm s/rad] (measured on the vendor's controller)."""
 
-# A field beyond these is not a Z1's: several times what it can do, so that a real but strange arm is never refused.
+# Several times the capability of a Z1, so that a real but unusual measurement is never rejected.
 _FIELDS = ("tau", "dq", "ddq", "q")
 _PLAUSIBLE = np.array([300.0, 100.0, 1e5, 50.0])
 
 
 class ProtocolError(HalError, ValueError):
-    """A datagram that is not what the protocol allows; the message names the field."""
+    """A datagram outside the protocol; the message names the field."""
+
+    default_code = "protocol"
 
 
 class MotorError(IntFlag):
@@ -45,11 +47,11 @@ class MotorError(IntFlag):
     OVERHEAT = 0x04
     PARAMETER_JUMP = 0x20
     IGNORE = 0x40
-    """Set at will by the motors; means nothing."""
+    """Set at random by the motors; without meaning (measured on the vendor's controller)."""
 
 
 class MotorLink(IntEnum):
-    """How the arm board hears a motor."""
+    """Connection of a motor to the motor board."""
 
     OK = 0
     LOST = 1
@@ -62,8 +64,10 @@ def _zeros() -> np.ndarray:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class JointCommands:
-    """What N joints are told; N is 7, or 6 without the gripper. A motor makes
-    tau + KP_SCALE · kp · (q − q_measured) + KD_SCALE · kd · (dq − dq_measured)."""
+    """Commands of N joints; N is 7, or 6 without the gripper.
+
+    A motor's torque is tau + KP_SCALE · kp · (q − q_measured) + KD_SCALE · kd · (dq − dq_measured).
+    """
 
     q: np.ndarray = field(default_factory=_zeros)
     """(N,) positions [rad]."""
@@ -79,7 +83,7 @@ class JointCommands:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class JointStates:
-    """What N joints measure; N is 7, or 6 without the gripper."""
+    """Measurements of N joints; N is 7, or 6 without the gripper."""
 
     q: np.ndarray = field(default_factory=_zeros)
     """(N,) positions [rad]."""
@@ -90,7 +94,7 @@ class JointStates:
     tau: np.ndarray = field(default_factory=_zeros)
     """(N,) torques [Nm]."""
     temperature_c: np.ndarray = field(default_factory=lambda: np.zeros((z1.N_JOINTS, 2), dtype=np.int8))
-    """(N, 2) int8, motor temperatures [°C]; the second column means something for joint 2 alone."""
+    """(N, 2) int8, motor temperatures [°C]; the second column is valid for joint 2 alone."""
     error: np.ndarray = field(default_factory=lambda: np.zeros((z1.N_JOINTS, 2), dtype=np.uint8))
     """(N, 2) uint8, `MotorError` bits."""
     link: np.ndarray = field(default_factory=lambda: np.zeros((z1.N_JOINTS, 2), dtype=np.uint8))
@@ -109,7 +113,7 @@ def pack_commands(commands: JointCommands) -> np.ndarray:
 def unpack_commands(records: np.ndarray) -> JointCommands:
     """Return the commands in records (N,) of `JOINT_CMD`.
 
-    Any finite number passes: limiting is for who obeys.
+    Any finite number passes: the executing side limits it.
 
     Raises:
         ProtocolError: a value that is not finite.
@@ -141,7 +145,7 @@ def unpack_states(records: np.ndarray) -> JointStates:
     Raises:
         ProtocolError: a value that is not finite, or that no Z1 can have.
     """
-    # Through the bytes: a structured array costs several times as much to look through, 500 times a second.
+    # Through the bytes: reading a structured array costs several times as much, 500 times a second.
     raw = records.view(np.uint8).reshape(len(records), -1)
     floats = np.ascontiguousarray(raw[:, : JOINT_STATE_OLD.itemsize]).view("<f4")
     if not (np.abs(floats) <= _PLAUSIBLE).all():  # false for a NaN, too
@@ -167,12 +171,15 @@ def _pack(values: JointCommands | JointStates, dtype: np.dtype, names: tuple[str
 def _not_finite(records: np.ndarray, names: tuple[str, ...]) -> ProtocolError:
     name = next(name for name in names if not np.isfinite(records[name]).all())
     joint = int(np.argmin(np.isfinite(records[name])))
-    return ProtocolError(f"{name} of {z1.JOINT_NAMES[joint]} is {records[name][joint]}; it must be finite.")
+    return ProtocolError(
+        f"{name} of {z1.JOINT_NAMES[joint]} is {records[name][joint]}; it must be finite.", code="not_finite"
+    )
 
 
 def _not_plausible(values: np.ndarray) -> ProtocolError:
     joint, column = divmod(int(np.argmin(np.abs(values) <= _PLAUSIBLE)), len(_FIELDS))
     return ProtocolError(
-        f"{_FIELDS[column]} of {z1.JOINT_NAMES[joint]} is {values[joint, column]}; a Z1 never measures beyond "
-        f"±{_PLAUSIBLE[column]:g} (SI units)."
+        f"{_FIELDS[column]} of {z1.JOINT_NAMES[joint]} is {values[joint, column]}; a Z1 measures at most "
+        f"±{_PLAUSIBLE[column]:g} (SI units).",
+        code="implausible_value",
     )

@@ -1,4 +1,4 @@
-"""States of the vendor's controller: their numbers on the wire, and which may be asked for from which."""
+"""States of the vendor's controller: their numbers on the wire, and the transitions between them."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ from enum import IntEnum
 
 
 class Fsm(IntEnum):
-    """What the controller is doing; the numbers are those on the wire (the vendor's Python stub has others)."""
+    """State of the controller, numbered as on the wire (measured; the vendor's Python stub has other numbers)."""
 
     INVALID = 0
-    """In a command: keep what you are."""
+    """No state change requested."""
     PASSIVE = 1
     """Damped, without stiffness: the arm sinks."""
     JOINTCTRL = 2
@@ -25,7 +25,7 @@ class Fsm(IntEnum):
     SAVESTATE = 9
     """Saves the pose under a label."""
     TEACH = 10
-    """Records while somebody moves the arm by hand."""
+    """Records while the arm is guided by hand."""
     TEACHREPEAT = 11
     """Plays such a recording."""
     CALIBRATION = 12
@@ -57,20 +57,20 @@ _FROM_MOVING = {Fsm.JOINTCTRL, Fsm.PASSIVE}
 _FROM_HOLDING = MOVES | {Fsm.PASSIVE, Fsm.JOINTCTRL, Fsm.CARTESIAN, Fsm.TEACH, Fsm.SETTRAJ}
 
 
-def granted(now: Fsm, asked: Fsm) -> bool:
-    """Whether the controller, being in `now`, follows a request for `asked`; else it stays where it is.
+def is_granted(present: Fsm, requested: Fsm) -> bool:
+    """Return whether the controller, in state `present`, grants a request for `requested`; else it ignores it.
 
-    Observed: everything about PASSIVE and LOWCMD, and that moves start from JOINTCTRL. Assumed from the vendor's
-    examples, which do it: moves from CARTESIAN, and JOINTCTRL or PASSIVE out of a move or a teaching.
+    Measured on the vendor's controller: everything about PASSIVE and LOWCMD, and that moves start from JOINTCTRL.
+    Assumed from the vendor's examples: moves from CARTESIAN, and JOINTCTRL or PASSIVE out of a move or a teaching.
     """
-    if asked in (now, Fsm.INVALID):
+    if requested in (present, Fsm.INVALID):
         return True
-    match now:
+    match present:
         case Fsm.PASSIVE:
-            return asked in _FROM_PASSIVE
+            return requested in _FROM_PASSIVE
         case Fsm.LOWCMD:
-            return asked in _FROM_LOWCMD
+            return requested in _FROM_LOWCMD
         case Fsm.JOINTCTRL | Fsm.CARTESIAN:
-            return asked in _FROM_HOLDING
+            return requested in _FROM_HOLDING
         case _:
-            return asked in _FROM_MOVING
+            return requested in _FROM_MOVING

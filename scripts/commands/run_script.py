@@ -1,10 +1,10 @@
-"""Run a script written for pyrealsense2 or for the Z1's vendor module, unmodified, on the twin.
+"""Run a script for pyrealsense2 or for the Z1's vendor module, unmodified, on the twin.
 
     ./z1 twin run-script --object box --frames 100 viewer.py --its-own options
 
-In the script `import pyrealsense2` gives librealsense with the twin for a camera, and `import unitree_arm_interface`
-the vendor's names for an arm that stands in the same scene, at its own controller: nothing of a real arm is touched.
-Windows that OpenCV cannot open here are written to files when the script ends.
+In the script `import pyrealsense2` gives librealsense with the twin as its camera, and `import unitree_arm_interface`
+the vendor's names for an arm in the same scene, with its own controller: no real arm is used. Where OpenCV has no
+windows, their last images are written to files when the script ends.
 """
 
 from __future__ import annotations
@@ -34,29 +34,29 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Config:
-    """What stands where, and how time passes."""
+    """Script, scene, and course of time."""
 
     file: tyro.conf.Positional[Path]
-    """The script; what stands behind it is handed to it."""
+    """The script; the arguments after it are passed to it."""
     object: str = "bottle"
-    """What stands on the table: bottle, box or cylinder."""
+    """Object on the table: bottle, box or cylinder."""
     distance_m: float = 0.48
-    """How far in front of the base [m]."""
+    """Distance of the object in front of the base [m]."""
     lateral_m: float = 0.0
-    """How far to the left [m]."""
+    """Offset of the object to the left [m]."""
     pitch_deg: float = 0.0
-    """Lean about the base's y axis [°]."""
+    """Tilt of the object about the base's y axis [°]."""
     start: Literal["home", "startFlat"] = "home"
-    """How the arm lies until the first command comes: looking ahead, or folded, as the real one is switched on."""
+    """Initial pose: home, the camera's viewpoint, or folded, as the real one is switched on."""
     seed: int = 0
-    """Of the camera's noise."""
+    """Seed of the camera's noise."""
     lockstep: bool = False
-    """Frames are made when the script waits for them, the same ones every time, and the arm stands still; else all
-    goes by the wall's clock."""
+    """Frames are made when the script waits for them, reproducibly, and the arm does not move; else the twin runs by
+    the wall clock."""
     frames: int = 0
-    """After so many pictures shown, waitKey() answers Esc and q in turn; 0 = never."""
+    """Number of images shown after which waitKey() returns Esc and q in turn; 0 = never."""
     windows: Path = Path("out/run-script")
-    """Where the pictures of its windows go."""
+    """Folder of the images of its windows."""
 
 
 def main(arguments: list[str]) -> int:
@@ -64,7 +64,7 @@ def main(arguments: list[str]) -> int:
     end = next((i for i, argument in enumerate(arguments, start=1) if argument.endswith(".py")), len(arguments))
     config = tyro.cli(Config, prog="z1 twin run-script", description=__doc__, args=arguments[:end])
     if not config.file.is_file():
-        raise InvalidValueError(f"there is no script {config.file}.")
+        raise InvalidValueError(f"there is no script {config.file}.", code="missing_script")
     from sim_twin.model.scene import SceneConfig
 
     scene = SceneConfig(
@@ -74,20 +74,22 @@ def main(arguments: list[str]) -> int:
         pitch_deg=config.pitch_deg,
         seed=config.seed,
     )
-    robot = lockstep_robot(scene) if config.lockstep else wired_robot(scene, config.start)
+    robot = lockstep_robot(scene) if config.lockstep else wire_robot(scene, config.start)
     with robot as clock, windows_as_files(config.windows, clock, config.frames):
         return run_program(config.file, arguments[end:])
 
 
 @contextmanager
 def lockstep_robot(scene: SceneConfig) -> Iterator[Clock]:
-    """Let the names mean a camera that makes its frames when they are waited for, in a scene that stands still."""
+    """Substitute the vendors' modules by a lock-step camera in a static scene."""
     from sim_twin.clock import TwinClock
     from sim_twin.drop_in.realsense_source import TwinSource
     from sim_twin.model.world import World
 
-    def refuse(config: Z1ArmConfig) -> Z1Arm:
-        raise CommandRejectedError("with --lockstep the twin's arm stands still; to move it leave that out.")
+    def reject(config: Z1ArmConfig) -> Z1Arm:
+        raise CommandRejectedError(
+            "with --lockstep the twin's arm does not move; leave that option out to move it.", code="lockstep"
+        )
 
     world = World(scene)
     clock = TwinClock(world)
@@ -95,13 +97,13 @@ def lockstep_robot(scene: SceneConfig) -> Iterator[Clock]:
         source = undo.enter_context(TwinSource(world, clock))
         source.warm_up()
         undo.enter_context(_camera(source))
-        undo.enter_context(_arm(make_arm=refuse))
+        undo.enter_context(_arm(make_arm=reject))
         yield clock
 
 
 @contextmanager
-def wired_robot(scene: SceneConfig, start: Literal["home", "startFlat"]) -> Iterator[Clock]:
-    """Let the names mean an arm and a camera in a scene that lives by the wall's clock, in processes of its own."""
+def wire_robot(scene: SceneConfig, start: Literal["home", "startFlat"]) -> Iterator[Clock]:
+    """Substitute the vendors' modules by arm and camera of a scene in other processes, by the wall clock."""
     from hal.compat.unitree_arm_interface import UDPPort
     from scripts.commands.run_wire import start_pose
     from sim_twin.drop_in.camera_process import RemoteSource
@@ -111,14 +113,14 @@ def wired_robot(scene: SceneConfig, start: Literal["home", "startFlat"]) -> Iter
 
     command_port, state_port = free_ports()
     twin = WireProcess(scene, WireConfig(command_port=command_port, state_port=state_port), start_pose(start))
-    atexit.register(twin.close)  # a script's arm is let go of at exit, later registered and so before this
+    atexit.register(twin.close)  # runs after the script's own exit handlers, which disconnect its arm
     twin.start()
     with ExitStack() as undo:
         source = RemoteSource(twin)
         try:
             undo.enter_context(_camera(source))
             source.warm_up()
-        except SdkMissingError as missing:  # a script that moves the arm alone does not need it
+        except SdkMissingError as missing:  # not needed by a script for the arm alone
             print(f"no camera: {missing}", file=sys.stderr)
         undo.enter_context(_arm(udp=UDPPort("127.0.0.1", command_port, state_port)))
         yield source.clock
@@ -134,7 +136,7 @@ def _camera(source: FrameSource) -> Iterator[None]:
 
 @contextmanager
 def _arm(*, udp: UDPPort | None = None, make_arm: Callable[[Z1ArmConfig], Z1Arm] | None = None) -> Iterator[None]:
-    """Let `import unitree_arm_interface` give ours, its interfaces at the controller `udp`, or made by `make_arm`."""
+    """Substitute `unitree_arm_interface` by ours, with the controller at `udp`, or with drivers of `make_arm`."""
     import hal.compat.unitree_arm_interface as vendor
 
     interface = vendor.ArmInterface
@@ -148,7 +150,7 @@ def _arm(*, udp: UDPPort | None = None, make_arm: Callable[[Z1ArmConfig], Z1Arm]
 
 
 def run_program(file: Path, arguments: list[str]) -> int:
-    """Run a script as Python would run it, in this process, and return its exit code."""
+    """Run a script in this process as Python does, and return its exit code."""
     sys.argv = [str(file), *arguments]
     sys.path.insert(0, str(file.resolve().parent))
     try:

@@ -1,11 +1,11 @@
-"""The digital twin in place of a device, for programs that were written for the device.
+"""The digital twin in place of a device, for programs written for the device.
 
-    ./z1 twin run-script [options] FILE.py [its own arguments]    a script for pyrealsense2 sees the twin's D405, one
-                                                                  for unitree_arm_interface moves the twin's Z1
+    ./z1 twin run-script [options] FILE.py [its own arguments]    a script for pyrealsense2 uses the twin's D405, one
+                                                                  for unitree_arm_interface the twin's Z1
     ./z1 twin wire [options]                                      the twin's Z1 in place of `z1_ctrl`, or of the arm's
-                                                                  board (or: twin --wire)
+                                                                  motor board (or: twin --wire)
 
-`./z1 twin run-script --help` and `./z1 twin wire --help` tell the options.
+`./z1 twin run-script --help` and `./z1 twin wire --help` list the options.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _BAD_USAGE = 2
 
 
 def main(arguments: list[str]) -> int:
-    """Do what the first argument names."""
+    """Run the step named by the first argument."""
     name, *rest = arguments or [""]
     name = "wire" if name == "--wire" else name
     if name in _STEPS:

@@ -1,10 +1,10 @@
-"""The twin's Z1 in place of the real one: programs for a real Z1 drive it over UDP.
+"""The twin's Z1 behind the vendor's UDP protocol: programs for a real Z1 drive it unmodified.
 
     ./z1 twin wire                                             as `z1_ctrl`: listens on 8071, answers to port 8072
     ./z1 twin wire --command-port 8073 --state-port 8074       a second arm
-    ./z1 twin wire --depth board                               as the arm's board: the vendor's `z1_ctrl` drives it on
-                                                               8880, with this machine's address in its config.xml
-    ./z1 twin wire --view                                      seen in Rerun
+    ./z1 twin wire --depth board                               as the arm's motor board: the vendor's `z1_ctrl` drives
+                                                               it on 8880, with this address in its config.xml
+    ./z1 twin wire --view                                      shown live in Rerun
 
 Stop it with Ctrl-C.
 """
@@ -29,25 +29,25 @@ if TYPE_CHECKING:
     from sim_twin.drop_in.process import WireProcess
     from sim_twin.model.scene import SceneConfig
 
-_LOOK_S = 0.1
+_POLL_S = 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
 class Config:
-    """What it stands for, where it answers, how the arm lies, and what stands on the table."""
+    """Replaced part of the robot, addresses, initial pose and scene."""
 
     wire: Annotated[WireConfig, tyro.conf.arg(name="")] = field(default_factory=WireConfig)
-    """What it stands for, and where."""
+    """Replaced part of the robot, and addresses."""
     start: Literal["startFlat", "home"] = "startFlat"
-    """How the arm lies until the first command comes: folded, as the real one is switched on, or looking ahead."""
+    """Initial pose: folded, as the real one is switched on, or home, the camera's viewpoint."""
     object: str = "bottle"
-    """What stands on the table: bottle, box or cylinder."""
+    """Object on the table: bottle, box or cylinder."""
     distance_m: float = 0.48
-    """How far in front of the base [m]."""
+    """Distance of the object in front of the base [m]."""
     lateral_m: float = 0.0
-    """How far to the left [m]."""
+    """Offset of the object to the left [m]."""
     pitch_deg: float = 0.0
-    """Lean about the base's y axis [°]."""
+    """Tilt of the object about the base's y axis [°]."""
     view: bool = False
     """Show it live in Rerun."""
     view_port: int = 9876
@@ -55,7 +55,7 @@ class Config:
 
 
 def main(arguments: list[str]) -> int:
-    """Answer until told to stop."""
+    """Serve until a signal arrives."""
     from sim_twin.drop_in.process import WireProcess
 
     config = tyro.cli(Config, prog="z1 twin wire", description=__doc__, args=arguments)
@@ -66,18 +66,18 @@ def main(arguments: list[str]) -> int:
     with ExitStack() as undo:
         twin.start()
         undo.callback(twin.close)
-        to = "whoever asks" if wire.depth == "board" else f"{wire.client_host}:{wire.state_port}"
+        to = "the sender" if wire.depth == "board" else f"{wire.client_host}:{wire.state_port}"
         print(f"the twin's {wire.depth} listens on {wire.host}:{wire.port} and answers to {to}; Ctrl-C ends it.")
         print(READY, flush=True)
         if config.view:
             _show(twin, config.view_port, stop_event)
-        while not stop_event.wait(_LOOK_S) and twin.alive:
+        while not stop_event.wait(_POLL_S) and twin.running:
             pass
-        if ended := twin.why_it_ended():
+        if ended := twin.exit_reason():
             raise HalError(ended)
-        account = twin.account()
-    why = f" (the last one: {account['last_refusal']})" if account["refused"] else ""
-    print(f"{account['answers']} answers; {account['refused']} datagrams were no commands{why}")
+        statistics = twin.statistics()
+    reason = f" (the last one: {statistics['invalid_reason']})" if statistics["invalid_datagrams"] else ""
+    print(f"{statistics['answers']} answers; {statistics['invalid_datagrams']} invalid datagrams{reason}")
     return 0
 
 
@@ -107,12 +107,12 @@ def start_pose(start: Literal["startFlat", "home"]) -> np.ndarray | None:
 
 
 def _show(twin: WireProcess, port: int, stop_event: Event) -> None:
-    """Show the twin until `stop_event` is set, or it is gone."""
+    """Show the twin until `stop_event` is set, or its process ends."""
     from scripts.support.twin_view import RATE_HZ, TwinView
 
     view = TwinView(twin, port=port)
     try:
-        while not stop_event.wait(1.0 / RATE_HZ) and twin.alive:
+        while not stop_event.wait(1.0 / RATE_HZ) and twin.running:
             view.update()
     finally:
         view.close()

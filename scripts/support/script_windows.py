@@ -1,4 +1,4 @@
-"""OpenCV's windows where it has none: their last pictures are written to files."""
+"""Replacement of OpenCV's windows where it has none: their last images are written to files."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ _SILENT += ("createTrackbar", "setTrackbarPos", "destroyWindow", "destroyAllWind
 
 
 class Windows:
-    """What a script shows, and the keys it is told were pressed.
+    """Images shown by a script, and simulated key presses.
 
     Args:
-        clock: by which `waitKey` waits.
-        frames: after so many pictures it is told Esc and q in turn; 0 = never.
+        clock: clock of `waitKey`.
+        frames: number of images after which Esc and q are pressed in turn; 0 = never.
     """
 
     def __init__(self, clock: Clock, frames: int) -> None:
         self._clock, self._frames = clock, frames
-        self._pictures: dict[str, np.ndarray] = {}
-        self._shown = self._asked = 0
+        self._images: dict[str, np.ndarray] = {}
+        self._shown = self._keys = 0
 
-    def show(self, window: str, picture: Any) -> None:
-        """Keep a copy of the picture for `save`."""
-        self._pictures[window] = np.array(picture)
+    def show(self, window: str, image: Any) -> None:
+        """Keep a copy of the image for `save`."""
+        self._images[window] = np.array(image)
         self._shown += 1
 
     def wait_key(self, delay_ms: int = 0) -> int:
@@ -43,23 +43,23 @@ class Windows:
         self._clock.sleep_until(self._clock.now_s() + 1e-3 * max(delay_ms, 1))
         if not self._frames or self._shown < self._frames:
             return _NO_KEY
-        self._asked += 1
-        return _ESC if self._asked % 2 else ord("q")
+        self._keys += 1
+        return _ESC if self._keys % 2 else ord("q")
 
     def save(self, folder: Path) -> list[Path]:
-        """Write the last picture of each window and return the files."""
+        """Write the last image of each window and return the files."""
         files = []
-        for window, picture in self._pictures.items():
+        for window, image in self._images.items():
             folder.mkdir(parents=True, exist_ok=True)
             files.append(folder / f"{re.sub(r'[^A-Za-z0-9]+', '_', window).strip('_') or 'window'}.png")
-            scaled = 255.0 * picture if picture.dtype.kind == "f" else picture  # as imshow() does
-            cv2.imwrite(str(files[-1]), scaled.astype(np.uint16 if picture.dtype == np.uint16 else np.uint8))
+            scaled = 255.0 * image if image.dtype.kind == "f" else image  # as imshow() does
+            cv2.imwrite(str(files[-1]), scaled.astype(np.uint16 if image.dtype == np.uint16 else np.uint8))
         return files
 
 
 @contextmanager
 def windows_as_files(folder: Path, clock: Clock, frames: int) -> Iterator[Windows | None]:
-    """Give an OpenCV that was built without windows some that end up in `folder`; leave any other alone."""
+    """Replace the windows of an OpenCV built without any, and write them to `folder` at the end."""
     if not re.search(r"GUI:\s+NONE", cv2.getBuildInformation()):
         yield None
         return

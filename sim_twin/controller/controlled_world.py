@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from hal.base import z1
-from hal.z1_protocol.board import PERIOD_S
 from hal.z1_protocol.controller import decode_command, encode_state
+from hal.z1_protocol.motor_board import PERIOD_S
 from hal.z1_protocol.records import JointStates, ProtocolError
 from hal.z1_protocol.states import Fsm
 from sim_twin.controller.controller import Controller
@@ -19,74 +19,75 @@ _BOARD_TICKS = round(PERIOD_S / z1.CONTROL_PERIOD_S)
 class ControlledWorld:
     """Controller and motors of one world; no sockets, no clock, no thread.
 
-    Until the first command nothing is told to the motors, and the arm stays where it is parked. The controller works,
-    and exchanges commands and measurements with the motors, at 250 Hz, so every second answer repeats the measurement.
+    Until the first command the motors get none, and the arm stays parked. The controller works, and exchanges commands
+    and measurements with the motors, at 250 Hz, so every second answer repeats the measurement.
 
     Args:
-        world: whose arm it is; who owns it calls `tick` before each of its steps.
-        ailments: a record of `sim_twin.controller.fault_injection.AILMENTS`, written into from outside.
+        world: world of the arm; its owner calls `tick` before each of its steps.
+        injected_faults: a record of `sim_twin.controller.fault_injection.INJECTED_FAULTS`, written from outside.
     """
 
-    def __init__(self, world: World, ailments: np.ndarray | None = None) -> None:
+    def __init__(self, world: World, injected_faults: np.ndarray | None = None) -> None:
         self.world = world
-        self.motors = Motors(world, ailments)
-        """While their board is silent they are told nothing, and the last measurement is told."""
+        self.motors = Motors(world, injected_faults)
+        """The motors; while their board is silent they get no commands, and the last measurement is repeated."""
         self.awake = False
-        """Whether a command has come."""
-        self.refused = 0
+        """Whether a command was received."""
+        self.invalid_datagrams = 0
         """Datagrams that were no commands."""
-        self.last_refusal = ""
-        """Why the last one was none."""
+        self.invalid_reason = ""
+        """Reason for the last one."""
         self._measured = self.motors.measure()
         self.controller = Controller(self._measured)
         self._ticks = 0
-        self._heard = False
-        self._told: tuple[Fsm, JointStates] | None = None
+        self._reply_due = False
+        self._encoded: tuple[Fsm, JointStates] | None = None
         self._answer = b""
 
-    def hear(self, data: bytes | memoryview) -> None:
-        """Obey a datagram; what is answered, `tell` says."""
-        self._heard |= self.take(data)
+    def receive(self, data: bytes | memoryview) -> None:
+        """Process a datagram; `reply` returns the answer."""
+        self._reply_due |= self._execute(data)
 
-    def tell(self) -> bytes | None:
-        """Return the answer if there was a command since the last time: the controller answers in its own rhythm."""
-        heard, self._heard = self._heard, False
-        return self.answer() if heard else None
-
-    def take(self, data: bytes | memoryview) -> bool:
-        """Obey a datagram; False when it was refused and counted. Never raises."""
-        try:
-            self.controller.obey(decode_command(data))
-        except ProtocolError as error:
-            self.refused += 1
-            self.last_refusal = str(error)
-            return False
-        self.awake = True
-        return True
+    def reply(self) -> bytes | None:
+        """Return the answer if a command was received since the last call: the controller answers at its own rate."""
+        due, self._reply_due = self._reply_due, False
+        return self.answer() if due else None
 
     def answer(self) -> bytes:
-        """Return what the controller tells now, 208 B."""
+        """Return the controller's present answer, 208 B."""
         now = self.controller.fsm, self.controller.measured
-        if self._told is None or now[0] is not self._told[0] or now[1] is not self._told[1]:  # every second one repeats
-            self._told, self._answer = now, encode_state(self.controller.answer())
+        # Every second answer repeats the one before: encode it once.
+        if self._encoded is None or now[0] is not self._encoded[0] or now[1] is not self._encoded[1]:
+            self._encoded, self._answer = now, encode_state(self.controller.answer())
         return self._answer
 
     def handle(self, data: bytes | memoryview) -> bytes | None:
-        """Obey a datagram and return the answer; None when it was refused."""
-        return self.answer() if self.take(data) else None
+        """Process a datagram and return the answer; None when it was invalid."""
+        return self.answer() if self._execute(data) else None
 
     def tick(self) -> None:
-        """Let the controller work for 2 ms; to be called before each step of the world."""
+        """Advance the controller by 2 ms; to be called before each step of the world."""
         if self._ticks % _BOARD_TICKS == 0:
             self._exchange()
         self._ticks += 1
         self.motors.tick()
 
+    def _execute(self, data: bytes | memoryview) -> bool:
+        """Execute a datagram; return False when it was invalid and counted. Never raises."""
+        try:
+            self.controller.handle_command(decode_command(data))
+        except ProtocolError as error:
+            self.invalid_datagrams += 1
+            self.invalid_reason = str(error)
+            return False
+        self.awake = True
+        return True
+
     def _exchange(self) -> None:
-        """Let the controller do its 4 ms of work, and exchange commands for measurements if the board speaks."""
-        heard = not self.motors.silent
-        if heard:
+        """Advance the controller by 4 ms, and exchange commands for measurements unless the motor board is silent."""
+        connected = not self.motors.silent
+        if connected:
             self._measured = self.motors.measure()
-        told = self.controller.step(self._measured, PERIOD_S)
-        if heard and self.awake:
-            self.motors.obey(told)
+        commands = self.controller.step(self._measured, PERIOD_S)
+        if connected and self.awake:
+            self.motors.handle_command(commands)

@@ -1,4 +1,4 @@
-"""A simulated arm behind its arm board: the self-check, and for every command what the motors measure."""
+"""A simulated arm behind its motor board: the self-check, and a measurement as the answer to every command."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from hal.backends.z1.faults import motor_values
 from hal.base import z1
-from hal.z1_protocol.board import (
+from hal.z1_protocol.motor_board import (
     COMMAND_SIZES,
     MOTOR_HEALTHY,
     SELF_CHECK,
@@ -21,31 +21,30 @@ from sim_twin.model.world import World
 _N_MOTORS_ARM = 7
 
 
-class ArmBoard:
-    """Board and motors of one world; no sockets, no clock, no thread.
+class MotorBoard:
+    """Motor board and motors of one world; no sockets, no clock, no thread.
 
-    As the real one it asks nobody who he is: whoever sends commands drives the motors. What it does to commands
-    before a self-check was never measured; here it obeys.
+    As the real one it has no access control: commands of any sender drive the motors. The real board's treatment of
+    commands before a self-check was never measured; this one executes them.
 
     Args:
-        world: whose arm it is; who owns it calls `tick` before each of its steps.
-        ailments: a record of `sim_twin.controller.fault_injection.AILMENTS`, written into from outside.
+        world: world of the arm; its owner calls `tick` before each of its steps.
+        injected_faults: a record of `sim_twin.controller.fault_injection.INJECTED_FAULTS`, written from outside.
         gripper: whether the gripper is connected: 8 motors and 7 records, or 7 and 6.
     """
 
-    def __init__(self, world: World, ailments: np.ndarray | None = None, *, gripper: bool = True) -> None:
+    def __init__(self, world: World, injected_faults: np.ndarray | None = None, *, gripper: bool = True) -> None:
         self.world = world
-        self.motors = Motors(world, ailments)
-        self.refused = 0
+        self.motors = Motors(world, injected_faults)
+        self.invalid_datagrams = 0
         """Datagrams that were neither self-check nor command."""
-        self.last_refusal = ""
-        """Why the last one was neither."""
+        self.invalid_reason = ""
+        """Reason for the last one."""
         self._gripper = gripper
         self._n = z1.N_JOINTS if gripper else z1.N_ARM
 
-    def hear(self, data: bytes | memoryview) -> bytes | None:
-        """Obey a datagram; return the answer, None when it was refused and counted, or while the board is dead.
-        Never raises."""
+    def receive(self, data: bytes | memoryview) -> bytes | None:
+        """Process a datagram; return the answer, None when it was invalid or the board is silent. Never raises."""
         if self.motors.silent:
             return None
         if data == SELF_CHECK:
@@ -53,26 +52,27 @@ class ArmBoard:
         try:
             if len(data) in COMMAND_SIZES and len(data) != COMMAND_SIZES[not self._gripper]:
                 raise ProtocolError(
-                    f"the command has {len(data)} bytes; of this board, with {self._n} joints, they have "
-                    f"{COMMAND_SIZES[not self._gripper]}."
+                    f"the command has {len(data)} bytes; allowed with {self._n} joints are "
+                    f"{COMMAND_SIZES[not self._gripper]}.",
+                    code="wrong_size",
                 )
-            self.motors.obey(decode_command(data))
+            self.motors.handle_command(decode_command(data))
         except ProtocolError as error:
-            self.refused += 1
-            self.last_refusal = str(error)
+            self.invalid_datagrams += 1
+            self.invalid_reason = str(error)
             return None
         return encode_state(self._measure())
 
     def tick(self) -> None:
-        """Let 2 ms pass; to be called before each step of the world."""
+        """Advance by 2 ms; to be called before each step of the world."""
         self.motors.tick()
 
-    def tell(self) -> None:
-        """A board speaks when it is asked."""
+    def reply(self) -> None:
+        """Return nothing: a motor board answers in `receive` only."""
 
     def _self_check(self) -> list[int]:
         healthy = motor_values(self.motors.link) == MotorLink.OK
-        return [MOTOR_HEALTHY if well else 0 for well in healthy[: None if self._gripper else _N_MOTORS_ARM]]
+        return [MOTOR_HEALTHY if ok else 0 for ok in healthy[: None if self._gripper else _N_MOTORS_ARM]]
 
     def _measure(self) -> JointStates:
         states = self.motors.measure()

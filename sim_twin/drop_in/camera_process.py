@@ -1,4 +1,4 @@
-"""The twin's optics in a process of their own: drawing in software holds no lock that the arm waits for."""
+"""The twin's optics in a process of their own: software rendering holds no lock that the arm waits for."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from sim_twin.model.scene import SceneConfig
 from sim_twin.model.scene_view import SceneView
 
 _IMAGES = ("depth", "colour", "left", "right")
-_MOST_PIXELS = max(width * height for width, height in MIN_Z_M)
+_MAX_PIXELS = max(width * height for width, height in MIN_Z_M)
 _FRAME = np.dtype(
-    [(name, "<u2" if name == "depth" else "u1", (_MOST_PIXELS * (1 if name == "depth" else 3),)) for name in _IMAGES]
+    [(name, "<u2" if name == "depth" else "u1", (_MAX_PIXELS * (1 if name == "depth" else 3),)) for name in _IMAGES]
 )
 
 
 class RemoteSource:
-    """`hal.base.d405.FrameSource` of a world in another process, drawn in a third, by the wall clock.
+    """`hal.base.d405.FrameSource` of a world in another process, rendered in a third, by the wall clock.
 
     Args:
-        twin: what it looks at.
-        calibration: of the unit; by default figures of real ones.
+        twin: the scene.
+        calibration: optics of the unit; by default figures of real ones.
     """
 
     lockstep = False
@@ -37,17 +37,17 @@ class RemoteSource:
         self.clock: Clock = WallClock()
         self.calibration = calibration if calibration is not None else D405Calibration()
         self.attached = True
-        """Set it to False to pull the cable."""
+        """Whether the cable is plugged in; writable, to inject a fault."""
         self.world = twin
         self._child: ChildProcess | None = None
         self._memory = make_memory(_FRAME.itemsize)
         self._frame = map_memory(self._memory, _FRAME)
 
     def start(self) -> None:
-        """Let the process begin, and wait until it can draw. Harmless when it has begun.
+        """Start the process, and wait until it can render. Harmless when started.
 
         Raises:
-            HalError: it could not begin; the message is its own.
+            HalError: it could not start; the message is its own.
         """
         if self._child is not None:
             return
@@ -59,25 +59,25 @@ class RemoteSource:
         child.wait_ready()
         self._child = child
 
-    def expose(self, look: CaptureRequest) -> Exposure:
-        """Return what the imagers see now.
+    def expose(self, request: CaptureRequest) -> Exposure:
+        """Return an exposure of the present scene.
 
         Raises:
-            CameraError: the renderer asked for cannot be had.
+            CameraError: the requested renderer is not available.
             HalError: one of the two processes has ended.
         """
         self.start()
         assert self._child is not None
-        stamp_s, present = self._child.ask(look)
-        images = {name: _image(self._frame, name, look).copy() for name in present}
-        return Exposure(number=look.number, stamp_s=stamp_s, **images)
+        stamp_s, present = self._child.request(request)
+        images = {name: _image(self._frame, name, request).copy() for name in present}
+        return Exposure(number=request.number, stamp_s=stamp_s, **images)
 
     def warm_up(self, width: int = 848, height: int = 480) -> None:
-        """Start the process and draw once, so that the first frame is as quick as the others."""
+        """Start the process and render once, so that the first frame is as fast as the others."""
         self.expose(CaptureRequest(number=0, width=width, height=height, depth=True, colour=True))
 
     def reset(self) -> None:
-        """Nothing hangs in here."""
+        """Do nothing: these optics have no state to reset."""
 
     def close(self) -> None:
         """End the process until the next `expose`."""
@@ -90,7 +90,7 @@ class RemoteSource:
 
 
 class _SharedView(SceneView):
-    """The scene in the memory that its world publishes into."""
+    """Scene in the shared memory that its world publishes into."""
 
     def __init__(self, config: SceneConfig, shared: SharedWorld, model: mujoco.MjModel) -> None:
         super().__init__(config)
@@ -108,27 +108,27 @@ class _SharedView(SceneView):
 def serve(
     connection: Connection, scene: SceneConfig, calibration: D405Calibration, files: tuple[int, int, int]
 ) -> None:
-    """Be the third process: draw what is asked for until the connection is closed.
+    """Run the third process: render on request until the connection is closed.
 
     Raises:
-        CameraError: the renderer asked for cannot be had.
+        CameraError: the requested renderer is not available.
     """
-    from sim_twin.drop_in.realsense_source import TwinSource  # drawing and noise are this process's to load
+    from sim_twin.drop_in.realsense_source import TwinSource  # only this process loads rendering and noise
 
     world, model, frames = files
     view, frame = _SharedView(scene, SharedWorld(world), load_model(model)), map_memory(frames, _FRAME)
-    with TwinSource(view, WallClock(), calibration=calibration, gives_way=False) as source:
+    with TwinSource(view, WallClock(), calibration=calibration, low_priority=False) as source:
         connection.send(None)
         while True:
-            look = connection.recv()
-            exposure = source.expose(look)
+            request = connection.recv()
+            exposure = source.expose(request)
             present = [name for name in _IMAGES if getattr(exposure, name) is not None]
             for name in present:
-                _image(frame, name, look)[...] = getattr(exposure, name)
+                _image(frame, name, request)[...] = getattr(exposure, name)
             connection.send((exposure.stamp_s, present))
 
 
-def _image(frame: np.ndarray, name: str, look: CaptureRequest) -> np.ndarray:
+def _image(frame: np.ndarray, name: str, request: CaptureRequest) -> np.ndarray:
     """Return the image `name` (H, W) or (H, W, 3) inside the shared frame."""
-    shape = (look.height, look.width) if name == "depth" else (look.height, look.width, 3)
+    shape = (request.height, request.width) if name == "depth" else (request.height, request.width, 3)
     return frame[name][: int(np.prod(shape))].reshape(shape)

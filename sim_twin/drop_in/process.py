@@ -1,4 +1,4 @@
-"""World and controller in a process of their own, as a robot's are: nobody's load and nobody's lock slows them down."""
+"""World and controller in a process of their own, as on a robot: no load and no lock of another process delays them."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ from sim_twin.model.scene import SceneConfig
 from sim_twin.model.scene_view import SceneView
 
 if TYPE_CHECKING:
-    from sim_twin.drop_in.udp_server import WiredWorld
+    from sim_twin.drop_in.udp_server import ArmEndpoint
 
-_LOOK_S = 0.05
+_POLL_S = 0.05
 
 
 class WireProcess(SceneView):
-    """A twin behind a wire in another process, and its scene as this one sees it.
+    """A twin behind the vendor's protocol in another process, and a view of its scene in this one.
 
-    It starts with its first use and lives, as a real controller does, whether anybody talks to it or not, until
-    `close`, the last reference to this, or the end of this process.
+    It starts with its first use and runs, as a real controller does, with or without a client, until `close`, the last
+    reference to this, or the end of this process.
 
     Args:
-        config: what stands where.
-        wire: where it listens.
-        q_start: (7,) where the arm starts [rad]; by default at home.
+        config: the scene.
+        wire: part of the robot that the twin replaces, and its addresses.
+        q_start: (7,) initial joints of the arm [rad]; by default home.
     """
 
     def __init__(self, config: SceneConfig, wire: WireConfig, q_start: np.ndarray | None = None) -> None:
@@ -44,17 +44,17 @@ class WireProcess(SceneView):
         self._model_file = make_memory(0)
         self._shared = SharedWorld(self._memory)
         self._child: ChildProcess | None = None
-        self.error: np.ndarray = self._shared.ailments["error"]
-        """(7, 2) `MotorError` bits; set them to break a motor."""
-        self.link: np.ndarray = self._shared.ailments["link"]
-        """(7, 2) `MotorLink`; the same."""
+        self.error: np.ndarray = self._shared.injected_faults["error"]
+        """(7, 2) `MotorError` bits; writable, to inject a fault."""
+        self.link: np.ndarray = self._shared.injected_faults["link"]
+        """(7, 2) `MotorLink`; writable, to inject a fault."""
 
     def start(self) -> None:
-        """Let it begin, and wait until it answers. Harmless when it has begun.
+        """Start the process, and wait until it answers. Harmless when started.
 
         Raises:
             LeaseError: another program has its port.
-            HalError: it could not begin; the message is its own.
+            HalError: it could not start; the message is its own.
         """
         if self._child is not None:
             return
@@ -67,61 +67,61 @@ class WireProcess(SceneView):
         self._child = child
 
     def close(self) -> None:
-        """End it. Harmless when it has not begun."""
+        """End the process. Harmless when not started."""
         child, self._child = self._child, None
         if child is not None:
             child.close()
 
     @property
-    def alive(self) -> bool:
-        """Whether it runs."""
-        return self._child is not None and self._child.alive
+    def running(self) -> bool:
+        """Whether the process runs."""
+        return self._child is not None and self._child.running
 
     @property
     def silent(self) -> bool:
-        """Whether its board is dead; may be set."""
-        return bool(self._shared.ailments["silent"])
+        """Whether the motor board is silent; writable, to inject a fault."""
+        return bool(self._shared.injected_faults["silent"])
 
     @silent.setter
     def silent(self, silent: bool) -> None:
-        self._shared.ailments["silent"] = silent
+        self._shared.injected_faults["silent"] = silent
 
-    def why_it_ended(self, timeout_s: float = 0.0) -> str:
-        """Return how it ended; empty while it runs, for `timeout_s` [s] longer, or when it has not begun."""
-        return "" if self._child is None else self._child.why_it_ended(timeout_s)
+    def exit_reason(self, timeout_s: float = 0.0) -> str:
+        """Return how the process ended; empty while it runs, after waiting `timeout_s` [s], or when not started."""
+        return "" if self._child is None else self._child.exit_reason(timeout_s)
 
-    def account(self) -> dict[str, Any]:
-        """Return what it has done: `answers`, `refused`, `last_refusal`.
+    def statistics(self) -> dict[str, Any]:
+        """Return the server's statistics: `answers`, `invalid_datagrams`, `invalid_reason`.
 
         Raises:
-            HalError: it has ended.
+            HalError: the process has ended.
         """
         self.start()
         assert self._child is not None
-        return self._child.ask("account")
+        return self._child.request("statistics")
 
     # --- The scene --------------------------------------------------------------------------------------------------
 
     @property
     def start_height_m(self) -> float:  # pyright: ignore[reportIncompatibleVariableOverride] - read only here
-        """Where the object's lowest point was at the start [m]."""
+        """Initial height of the object's lowest point [m]."""
         self.start()
         return self._shared.start_height_m
 
     @cached_property
     def model(self) -> mujoco.MjModel:
-        """What MuJoCo computes with: the other process's model, which took seconds to make."""
+        """MuJoCo's model, from the other process: compiling it takes seconds."""
         return load_model(self.model_file)
 
     @property
     def model_file(self) -> int:
-        """Descriptor of the file with the pickled model, for yet another process."""
+        """Descriptor of the file with the pickled model, for a third process."""
         self.start()
         return self._model_file
 
     @property
     def memory(self) -> int:
-        """Descriptor of the `SharedWorld`, for yet another process."""
+        """Descriptor of the `SharedWorld`, for a third process."""
         self.start()
         return self._memory
 
@@ -141,43 +141,43 @@ def load_model(fd: int) -> mujoco.MjModel:
 
 
 def make_twin(
-    scene: SceneConfig, wire: WireConfig, q_start: np.ndarray | None = None, ailments: np.ndarray | None = None
-) -> WiredWorld:
-    """Return a new world behind what `wire` says it is.
+    scene: SceneConfig, wire: WireConfig, q_start: np.ndarray | None = None, injected_faults: np.ndarray | None = None
+) -> ArmEndpoint:
+    """Return a new world behind the protocol of `wire`.
 
     Args:
-        scene: what stands where.
-        wire: which depth.
-        q_start: (7,) where the arm starts [rad]; by default at home.
-        ailments: a record of `sim_twin.controller.fault_injection.AILMENTS`, written into from outside.
+        scene: the scene.
+        wire: the depth at which the twin replaces the robot.
+        q_start: (7,) initial joints of the arm [rad]; by default home.
+        injected_faults: a record of `sim_twin.controller.fault_injection.INJECTED_FAULTS`, written from outside.
     """
-    from sim_twin.model.world import World  # physics and controller are the other process's to load
+    from sim_twin.model.world import World  # only the other process loads physics and controller
 
     world = World(scene, q_start)
     if wire.depth == "board":
-        from sim_twin.controller.motor_board import ArmBoard
+        from sim_twin.controller.motor_board import MotorBoard
 
-        return ArmBoard(world, ailments)
+        return MotorBoard(world, injected_faults)
     from sim_twin.controller.controlled_world import ControlledWorld
 
-    return ControlledWorld(world, ailments)
+    return ControlledWorld(world, injected_faults)
 
 
 def serve(
     connection: Connection, scene: SceneConfig, wire: WireConfig, q_start: np.ndarray | None, files: tuple[int, int]
 ) -> None:
-    """Be the other process: serve until the connection is closed.
+    """Run the other process: serve until the connection is closed.
 
     Raises:
         LeaseError: another program has the port.
-        Exception: whatever ended the server's thread.
+        Exception: the failure that ended the server's thread.
     """
     from sim_twin.drop_in.udp_server import WireServer
 
     logging.basicConfig(level=logging.WARNING, format="twin: %(message)s")
     memory, model = files
     shared = SharedWorld(memory)
-    twin = make_twin(scene, wire, q_start, shared.ailments)
+    twin = make_twin(scene, wire, q_start, shared.injected_faults)
     world = twin.world
     shared.start_height_m = world.start_height_m
     shared.publish(*world.poses())
@@ -185,7 +185,13 @@ def serve(
         pickle.dump(world.model, file)
     with WireServer(twin, wire, on_step=lambda: shared.publish(*world.poses())) as server:
         connection.send(None)
-        while server.alive:
-            if connection.poll(_LOOK_S):
+        while server.running:
+            if connection.poll(_POLL_S):
                 connection.recv()
-                connection.send({"answers": server.answers, "refused": twin.refused, "last_refusal": twin.last_refusal})
+                connection.send(
+                    {
+                        "answers": server.answers,
+                        "invalid_datagrams": twin.invalid_datagrams,
+                        "invalid_reason": twin.invalid_reason,
+                    }
+                )

@@ -1,4 +1,4 @@
-"""The optics of the twin's D405 for librealsense: depth rectified, colour as the raw left imager has it."""
+"""Optics of the twin's D405 for librealsense: rectified depth, unrectified colour of the left imager."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from sim_twin.model.world import World
 class TwinSource:
     """`hal.base.d405.FrameSource` of a world: `hal.compat.realsense.plug(TwinSource(world))`.
 
-    Drawing happens in a thread of its own, as an OpenGL context belongs to one thread.
+    Rendering has a thread of its own, as an OpenGL context belongs to one thread.
 
     Args:
-        world: what it looks at.
+        world: the scene.
         clock: a `TwinClock` of that world for lock-step (the default for a `World`), any other for free run.
-        renderer: one of `sim_twin.camera.gl.RENDERERS`; by default what the environment says.
-        calibration: of the unit; by default figures of real ones.
-        gives_way: whether it draws at low priority in free run, as in the process of a servo it must.
+        renderer: one of `sim_twin.camera.gl.RENDERERS`; by default the environment's choice.
+        calibration: optics of the unit; by default figures of real ones.
+        low_priority: whether it renders at low priority in free run, as required in the process of a servo.
     """
 
     def __init__(
@@ -41,7 +41,7 @@ class TwinSource:
         renderer: str | None = None,
         calibration: D405Calibration | None = None,
         *,
-        gives_way: bool = True,
+        low_priority: bool = True,
     ) -> None:
         self.world = world
         if clock is None:
@@ -50,31 +50,31 @@ class TwinSource:
         self.lockstep = isinstance(self.clock, TwinClock)
         self.calibration = calibration if calibration is not None else D405Calibration()
         self.attached = True
-        """Set it to False to pull the cable."""
+        """Whether the cable is plugged in; writable, to inject a fault."""
         self._kind = renderer
-        self._gives_way = gives_way and not self.lockstep
+        self._low_priority = low_priority and not self.lockstep
         self._snapshot = mujoco.MjData(world.model)
         self._optics: Optics | None = None
         self._renderer: WristRenderer | None = None
         self._thread: ThreadPoolExecutor | None = None
 
-    def expose(self, look: CaptureRequest) -> Exposure:
-        """Return what the imagers see now.
+    def expose(self, request: CaptureRequest) -> Exposure:
+        """Return an exposure of the present scene.
 
         Raises:
-            CameraError: the renderer asked for cannot be had.
+            CameraError: the requested renderer is not available.
         """
         if self._thread is None:
-            initializer = give_way if self._gives_way else None
+            initializer = give_way if self._low_priority else None
             self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="twin-d405", initializer=initializer)
-        return self._thread.submit(self._expose, look).result()
+        return self._thread.submit(self._expose, request).result()
 
     def warm_up(self, width: int = 848, height: int = 480) -> None:
-        """Open the renderer and draw once, so that the first frame is as quick as the others."""
+        """Open the renderer and render once, so that the first frame is as fast as the others."""
         self.expose(CaptureRequest(number=0, width=width, height=height, depth=True, colour=True))
 
     def reset(self) -> None:
-        """Nothing hangs in here."""
+        """Do nothing: these optics have no state to reset."""
 
     def close(self) -> None:
         """Free the renderer and its thread until the next `expose`."""
@@ -89,28 +89,32 @@ class TwinSource:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _expose(self, look: CaptureRequest) -> Exposure:
+    def _expose(self, request: CaptureRequest) -> Exposure:
         stamp_s = self.clock.now_s()
         data = self.world.snapshot(self._snapshot)
-        optics, renderer = self._prepare(look)
+        optics, renderer = self._prepare(request)
         view = renderer.render(data)
-        colour = optics.distort(view.colour) if look.colour else None
-        left = view.colour[optics.window] if look.left else None
-        right = self._draw_right(renderer, data).colour[optics.window] if look.right else None
+        colour = optics.distort(view.colour) if request.colour else None
+        left = view.colour[optics.window] if request.left else None
+        right = self._render_right(renderer, data).colour[optics.window] if request.right else None
         return Exposure(
-            number=look.number,
+            number=request.number,
             stamp_s=stamp_s,
-            depth=self._measure_depth(view.z_m[optics.window], optics.depth, look) if look.depth else None,
-            colour=self._measure_picture(colour, look, 0),
-            left=self._measure_picture(left, look, 1),
-            right=self._measure_picture(right, look, 2),
+            depth=self._measure_depth(view.z_m[optics.window], optics.depth, request) if request.depth else None,
+            colour=self._measure_image(colour, request, 0),
+            left=self._measure_image(left, request, 1),
+            right=self._measure_image(right, request, 2),
         )
 
-    def _prepare(self, look: CaptureRequest) -> tuple[Optics, WristRenderer]:
+    def _prepare(self, request: CaptureRequest) -> tuple[Optics, WristRenderer]:
         optics, renderer = self._optics, self._renderer
-        if optics is None or renderer is None or (optics.depth.width, optics.depth.height) != (look.width, look.height):
+        if (
+            optics is None
+            or renderer is None
+            or (optics.depth.width, optics.depth.height) != (request.width, request.height)
+        ):
             self._close_renderer()
-            optics = self._optics = Optics(self.calibration, look.width, look.height)
+            optics = self._optics = Optics(self.calibration, request.width, request.height)
             renderer = self._renderer = make_renderer(
                 self.world.model, optics.wide, self._kind, self.world.config.board, mask=False
             )
@@ -121,41 +125,41 @@ class TwinSource:
             self._renderer.close()
         self._renderer = None
 
-    def _draw_right(self, renderer: WristRenderer, data: mujoco.MjData) -> View:
+    def _render_right(self, renderer: WristRenderer, data: mujoco.MjData) -> View:
         number = camera_id(self.world.model)
         x_axis = data.cam_xmat[number].reshape(3, 3)[:, 0]
         data.cam_xpos[number] += BASELINE_M * x_axis
         return renderer.render(data)
 
-    def _measure_depth(self, z_m: np.ndarray, pinhole: Intrinsics, look: CaptureRequest) -> np.ndarray:
+    def _measure_depth(self, z_m: np.ndarray, pinhole: Intrinsics, request: CaptureRequest) -> np.ndarray:
         """Return the depth (H, W) in units."""
-        config, min_z_m = self.world.config, MIN_Z_M[look.width, look.height]
+        config, min_z_m = self.world.config, MIN_Z_M[request.width, request.height]
         if config.noise:
-            z_m = d405.measure_depth(np.ascontiguousarray(z_m), config.seed, look.number, pinhole, min_z_m)
+            z_m = d405.measure_depth(np.ascontiguousarray(z_m), config.seed, request.number, pinhole, min_z_m)
         else:
             z_m = d405.round_depth(np.ascontiguousarray(z_m), min_z_m)
         return np.rint(z_m / DEPTH_UNIT_M).astype(np.uint16)
 
-    def _measure_picture(self, picture: np.ndarray | None, look: CaptureRequest, imager: int) -> np.ndarray | None:
-        if picture is None:
+    def _measure_image(self, image: np.ndarray | None, request: CaptureRequest, imager: int) -> np.ndarray | None:
+        if image is None:
             return None
-        if look.brightness != 1.0:
-            picture = cv2.convertScaleAbs(picture, alpha=look.brightness)
+        if request.brightness != 1.0:
+            image = cv2.convertScaleAbs(image, alpha=request.brightness)
         if not self.world.config.noise:
-            return picture
-        return d405.measure_colour(np.ascontiguousarray(picture), self.world.config.seed, 3 * look.number + imager)
+            return image
+        return d405.measure_colour(np.ascontiguousarray(image), self.world.config.seed, 3 * request.number + imager)
 
 
 class Optics:
-    """Where each stream's pixels lie in one wide pinhole picture, which covers all that any of them sees.
+    """Pixels of each stream in one wide pinhole image, which covers the fields of view of all of them.
 
-    The wide picture has the depth stream's focal length and pixel grid, so depth and infrared are a window of it and
+    The wide image has the depth stream's focal length and pixel grid, so depth and infrared are a window of it and
     only colour is resampled.
 
     Args:
-        calibration: of the unit.
-        width: of the streams [px].
-        height: of the streams [px].
+        calibration: optics of the unit.
+        width: width of the streams [px].
+        height: height of the streams [px].
     """
 
     def __init__(self, calibration: D405Calibration, width: int, height: int) -> None:
@@ -175,12 +179,12 @@ class Optics:
         self._maps = (u - left).astype(np.float32), (v - top).astype(np.float32)
 
     def distort(self, wide: np.ndarray) -> np.ndarray:
-        """Return the unrectified colour image (height, width, 3) of a wide picture."""
+        """Return the unrectified colour image (height, width, 3) of a wide one."""
         return cv2.remap(wide, *self._maps, cv2.INTER_LINEAR)
 
 
 def _colour_in_depth(calibration: D405Calibration, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return for every colour pixel (height, width) where the depth stream's pinhole sees its ray [px]."""
+    """Return the columns and rows (height, width) of the colour pixels' rays in the depth stream's pinhole [px]."""
     colour, depth = calibration.colour(width, height), calibration.depth(width, height)
     pixels = np.stack(np.meshgrid(np.arange(width, dtype=float), np.arange(height, dtype=float)), axis=-1)
     until = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-9)
@@ -188,5 +192,5 @@ def _colour_in_depth(calibration: D405Calibration, width: int, height: int) -> t
         pixels.reshape(-1, 1, 2), colour.K, np.array(calibration.colour_coeffs), np.eye(3), np.eye(3), until
     )
     rays = cv2.convertPointsToHomogeneous(rays).reshape(-1, 3) @ calibration.R_colour_depth  # into depth axes
-    points = (rays[:, :2] / rays[:, 2:]) * [depth.fx, depth.fy] + [depth.cx, depth.cy]
-    return points[:, 0].reshape(height, width), points[:, 1].reshape(height, width)
+    u, v = depth.project(rays / rays[:, 2:]).T
+    return u.reshape(height, width), v.reshape(height, width)

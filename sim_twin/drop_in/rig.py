@@ -1,7 +1,7 @@
-"""The rig `wire-sim`: one simulated world behind both real drivers, the arm's on UDP, the camera's on librealsense.
+"""Rig `wire-sim`: one simulated world behind both real drivers, the arm's on UDP, the camera's on librealsense.
 
-Three processes, as on a robot: the drivers here, controller and physics in the second, the camera's optics in the
-third. In one of them, a thread that draws at low priority would hold the interpreter's lock that the arm waits for.
+Three processes, as on a robot: the drivers in this one, controller and physics in the second, the camera's optics in
+the third. In a single one, a rendering thread at low priority would hold the interpreter's lock that the arm needs.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ from sim_twin.drop_in.process import WireProcess
 from sim_twin.model.scene import SceneConfig
 
 _LOOPBACK = "127.0.0.1"
-_DYING_S = 0.2
+_EXIT_CODE_WAIT_S = 0.2  # between the last answer and the exit code of a process that ends [s]
 
 
-class WiredArm(Z1Arm):
-    """The real driver, and the controller that it talks to: that one is started when this one is connected.
+class WireSimArm(Z1Arm):
+    """Real driver of the Z1 that starts the twin's controller when it is connected.
 
     Args:
-        twin: the controller.
-        clock: the wall's.
-        mode: how the arm is commanded.
+        twin: process of the controller.
+        clock: the wall clock.
+        mode: command mode.
     """
 
     def __init__(self, twin: WireProcess, clock: Clock, mode: Z1Mode = Z1Mode.TRACKING) -> None:
@@ -52,17 +52,17 @@ class WiredArm(Z1Arm):
         try:
             return super().read_state()
         except HalError as error:
-            if ended := self.twin.why_it_ended(_DYING_S):
-                raise HalError(ended) from error
+            if ended := self.twin.exit_reason(_EXIT_CODE_WAIT_S):
+                raise HalError(ended, code="process_ended") from error
             raise
 
 
-class WiredCamera(D405Camera):
-    """The real driver, and the optics that it looks through: those are started when this one is connected.
+class WireSimCamera(D405Camera):
+    """Real driver of the D405 that starts the twin's optics when it is connected.
 
     Args:
-        twin: what it looks at.
-        config: what to stream.
+        twin: process with the scene.
+        config: streams.
     """
 
     def __init__(self, twin: WireProcess, config: D405CameraConfig | None = None) -> None:
@@ -71,27 +71,27 @@ class WiredCamera(D405Camera):
         super().__init__(config, source=self.optics)
 
     def connect(self) -> None:
-        self.optics.warm_up(self.config.width, self.config.height)  # seconds: no camera would be waited for so long
+        self.optics.warm_up(self.config.width, self.config.height)  # takes seconds, longer than the timeout of a camera
         super().connect()
 
 
-def make_wire_rig(scene: SceneConfig | None = None, mode: Z1Mode = Z1Mode.TRACKING, **_: Any) -> Rig:
+def make_wire_sim_rig(scene: SceneConfig | None = None, mode: Z1Mode = Z1Mode.TRACKING, **_: Any) -> Rig:
     """Return both real drivers on one new world by the wall clock, on free loopback ports, not yet connected.
 
     Args:
-        scene: what stands on the table; the default scene if None.
-        mode: how the arm is commanded.
+        scene: the scene; None = the default one.
+        mode: command mode of the arm.
         **_: options of other rigs.
     """
     clock = WallClock()
     command_port, state_port = free_ports()
     wire = WireConfig(host=_LOOPBACK, command_port=command_port, client_host=_LOOPBACK, state_port=state_port)
     twin = WireProcess(scene if scene is not None else SceneConfig(), wire)
-    return Rig(arm=WiredArm(twin, clock, mode), camera=WiredCamera(twin), clock=clock, world=twin)
+    return Rig(arm=WireSimArm(twin, clock, mode), camera=WireSimCamera(twin), clock=clock, world=twin)
 
 
 def free_ports() -> tuple[int, int]:
-    """Return two UDP ports of the loopback that nobody has at this moment."""
+    """Return two free UDP ports of the loopback interface."""
     with socket.socket(type=socket.SOCK_DGRAM) as one, socket.socket(type=socket.SOCK_DGRAM) as other:
         one.bind((_LOOPBACK, 0))
         other.bind((_LOOPBACK, 0))

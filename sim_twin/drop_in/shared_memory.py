@@ -1,4 +1,4 @@
-"""Memory that processes share, gone when the last of them is: the poses of a world, what ails its arm, and pictures."""
+"""Memory shared by processes, freed with the last of them: poses of a world, injected faults of its arm, images."""
 
 from __future__ import annotations
 
@@ -8,24 +8,25 @@ import tempfile
 
 import numpy as np
 
-from sim_twin.controller.fault_injection import AILMENTS
+from hal.base.errors import HalError
+from sim_twin.controller.fault_injection import INJECTED_FAULTS
 
-_MOST_POSITIONS = 512
+_MAX_POSITIONS = 512
 _WORLD = np.dtype(
     [
         ("version", "<u8"),
         ("time_s", "<f8"),
         ("nq", "<u8"),
-        ("qpos", "<f8", (_MOST_POSITIONS,)),
+        ("qpos", "<f8", (_MAX_POSITIONS,)),
         ("start_height_m", "<f8"),
-        ("ailments", AILMENTS),
+        ("injected_faults", INJECTED_FAULTS),
     ]
 )
-_MOST_TRIES = 1000
+_MAX_TRIES = 1000  # a write takes microseconds: so many torn reads in a row mean that the writer ended
 
 
 def make_memory(size: int) -> int:
-    """Return the descriptor of a file of `size` bytes without a name; hand it to a child process by `pass_fds`."""
+    """Return the descriptor of an anonymous file of `size` bytes; pass it to a child process by `pass_fds`."""
     if hasattr(os, "memfd_create"):
         fd = os.memfd_create("z1-twin")
     else:
@@ -36,16 +37,16 @@ def make_memory(size: int) -> int:
 
 
 def map_memory(fd: int, dtype: np.dtype, shape: tuple[int, ...] = ()) -> np.ndarray:
-    """Return an array in the memory behind `fd`, from its beginning, to read and write."""
+    """Return a writable array at the beginning of the memory behind `fd`."""
     size = dtype.itemsize * int(np.prod(shape))
     return np.ndarray(shape, dtype, buffer=mmap.mmap(fd, size))
 
 
 class SharedWorld:
-    """The poses of one world: one process publishes, any may read. What ails the arm goes the other way.
+    """Poses of one world, written by one process and read by any, and injected faults in the opposite direction.
 
     Args:
-        fd: of memory of `SharedWorld.SIZE` bytes.
+        fd: descriptor of a memory of `SharedWorld.SIZE` bytes.
     """
 
     SIZE = _WORLD.itemsize
@@ -56,12 +57,12 @@ class SharedWorld:
         self._time_s = self._record["time_s"]
         self._nq, self._qpos = self._record["nq"], self._record["qpos"]
         self._start_height_m = self._record["start_height_m"]
-        self.ailments: np.ndarray = self._record["ailments"]
-        """A record of `sim_twin.controller.fault_injection.AILMENTS`."""
+        self.injected_faults: np.ndarray = self._record["injected_faults"]
+        """A record of `sim_twin.controller.fault_injection.INJECTED_FAULTS`."""
 
     @property
     def start_height_m(self) -> float:
-        """Where the object's lowest point was at the start [m]; the publisher sets it."""
+        """Initial height of the object's lowest point [m]; the publisher sets it."""
         return float(self._start_height_m)
 
     @start_height_m.setter
@@ -70,7 +71,7 @@ class SharedWorld:
 
     def publish(self, time_s: float, qpos: np.ndarray) -> None:
         """Write MuJoCo's time [s] and positions (nq,), at most 512."""
-        self._version |= 1  # odd while it is written; and it is already if the publisher before died writing
+        self._version |= 1  # odd during a write; already odd if an earlier publisher ended during one
         self._time_s[...] = time_s
         self._nq[...] = len(qpos)
         self._qpos[: len(qpos)] = qpos
@@ -80,11 +81,11 @@ class SharedWorld:
         """Return the newest time [s] and positions (nq,), of one instant.
 
         Raises:
-            RuntimeError: the publisher died while it wrote.
+            HalError: the publisher ended during a write.
         """
-        for _ in range(_MOST_TRIES):
+        for _ in range(_MAX_TRIES):
             before = int(self._version)
             time_s, qpos = float(self._time_s), self._qpos[: int(self._nq)].copy()
             if before % 2 == 0 and before == int(self._version):
                 return time_s, qpos
-        raise RuntimeError("the process that moves the twin ended while it wrote; start it again.")
+        raise HalError("twin: the process of the world ended during a write; start it again.", code="torn_write")

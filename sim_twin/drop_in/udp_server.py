@@ -1,4 +1,4 @@
-"""The twin behind the ports of the vendor's controller, or of the arm board below it, in real time."""
+"""UDP server of the twin, at the ports of the vendor's controller or of the motor board below it, in real time."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Protocol, Self
 from hal.base.clock import Clock, WallClock
 from hal.base.errors import HalError, LeaseError
 from hal.base.z1 import CONTROL_PERIOD_S
-from hal.z1_protocol.board import PERIOD_S
+from hal.z1_protocol.motor_board import PERIOD_S
 from sim_twin.drop_in.config import WireConfig
 
 if TYPE_CHECKING:
@@ -24,56 +24,54 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-_FIFO_PRIORITY = 70
+_FIFO_PRIORITY = 70  # below the servo's thread, which waits for the answers
 _MAX_CATCH_UP_S = 0.020
-_MOST_AT_ONCE = 1024
-# Behind the controller nothing is exchanged with the motors in between, and every wake costs more than the work.
-_STEPS_AT_ONCE = {"controller": round(PERIOD_S / CONTROL_PERIOD_S), "board": 1}
-_LARGEST = 2048
+_MAX_DATAGRAMS = 1024
+# The controller exchanges nothing with the motors in between, and every wake-up costs more than a step.
+_STEPS_PER_WAKE = {"controller": round(PERIOD_S / CONTROL_PERIOD_S), "board": 1}
+_MAX_DATAGRAM = 2048  # ten times the largest valid one
 
 
-class WiredWorld(Protocol):
-    """A simulated arm behind a wire: `controlled_world.ControlledWorld` or `motor_board.ArmBoard` of
+class ArmEndpoint(Protocol):
+    """A simulated arm that exchanges datagrams: `controlled_world.ControlledWorld` or `motor_board.MotorBoard` of
     `sim_twin.controller`."""
 
     world: World
-    refused: int
-    """Datagrams that could not be obeyed."""
-    last_refusal: str
-    """Why the last one could not."""
+    invalid_datagrams: int
+    """Datagrams that could not be decoded."""
+    invalid_reason: str
+    """Reason for the last one."""
 
-    def hear(self, data: bytes | memoryview) -> bytes | None:
-        """Obey a datagram; return what is answered at once, to whoever sent it. Never raises."""
+    def receive(self, data: bytes | memoryview) -> bytes | None:
+        """Process a datagram; return the immediate answer to its sender, if any. Never raises."""
         ...
 
     def tick(self) -> None:
-        """Let 2 ms pass; called before each step of the world."""
+        """Advance by 2 ms; called before each step of the world."""
         ...
 
-    def tell(self) -> bytes | None:
-        """Return what is told to the client in this period, if anything."""
+    def reply(self) -> bytes | None:
+        """Return the answer to the client in this period, if any."""
         ...
 
 
 class WireServer:
-    """A thread that hears commands, moves the world, and answers, every 2 ms; in a `with` block, or by `start` and
-    `stop`.
+    """Server thread that receives commands, steps the world and answers every 2 ms; a context manager.
 
-    As the vendor's it obeys whoever sends a command. The controller answers to one address only, which a second
-    client cannot have, in those of its periods in which a command came; the board answers every single datagram at
-    once. When the client is gone the arm does what it was told last. Datagrams that are no commands are counted and
-    dropped.
+    As the vendor's it has no access control. The controller answers to one address only, which a second client cannot
+    have, in those of its periods in which a command was received; the motor board answers every single datagram at
+    once. Without a client the arm follows its last command. Invalid datagrams are counted and dropped.
 
     Args:
-        twin: the arm, and what stands before it.
-        config: where it is.
-        clock: the wall's.
-        on_step: called after the world has gone on, by 4 ms at most.
+        twin: arm behind the protocol.
+        config: addresses.
+        clock: the wall clock.
+        on_step: called after each advance of the world, of 4 ms at most.
     """
 
     def __init__(
         self,
-        twin: WiredWorld,
+        twin: ArmEndpoint,
         config: WireConfig | None = None,
         clock: Clock | None = None,
         on_step: Callable[[], None] = lambda: None,
@@ -84,17 +82,17 @@ class WireServer:
         """Answers sent."""
         self._clock = clock or WallClock()
         self._on_step = on_step
-        self._buffer = memoryview(bytearray(_LARGEST))
+        self._buffer = memoryview(bytearray(_MAX_DATAGRAM))
         self._end = threading.Event()
         self._thread: threading.Thread | None = None
         self._error: Exception | None = None
 
     def start(self) -> None:
-        """Take the port and begin. Harmless when it has begun.
+        """Bind the port and start the thread. Harmless when started.
 
         Raises:
             LeaseError: another program has the port.
-            HalError: there is no such address here.
+            HalError: no such address on this machine.
         """
         if self._thread is not None:
             return
@@ -105,10 +103,10 @@ class WireServer:
         self._thread.start()
 
     def stop(self) -> None:
-        """Give the port back; the world stands still. Harmless when it has not begun.
+        """End the thread and release the port; the world pauses. Harmless when not started.
 
         Raises:
-            Exception: what ended the thread before.
+            Exception: the failure that ended the thread before.
         """
         if self._thread is None:
             return
@@ -119,8 +117,8 @@ class WireServer:
             raise self._error
 
     @property
-    def alive(self) -> bool:
-        """Whether it answers."""
+    def running(self) -> bool:
+        """Whether the thread runs."""
         return self._thread is not None and self._thread.is_alive()
 
     def __enter__(self) -> Self:
@@ -140,57 +138,59 @@ class WireServer:
             inlet.close()
             if error.errno == errno.EADDRINUSE:
                 raise LeaseError(
-                    f"port {host}:{port} is taken: another {self.config.depth} runs here already "
-                    f"(`ss -lunp 'sport = :{port}'` names it). End it, or choose other ports."
+                    f"twin: port {host}:{port} is in use: another {self.config.depth} runs on this machine "
+                    f"(`ss -lunp 'sport = :{port}'` names it). End it, or choose other ports.",
+                    code="port_in_use",
                 ) from error
             raise HalError(
-                f"cannot listen on {host}:{port}: {error.strerror or error}. Choose an address of this machine."
+                f"twin: cannot listen on {host}:{port}: {error.strerror or error}. Choose an address of this machine.",
+                code="address_unavailable",
             ) from error
         return inlet
 
     def _run(self, inlet: socket.socket) -> None:
         try:
-            _hurry()
+            _request_real_time()
             with inlet:
                 self._serve(inlet)
-        except Exception as error:  # of every kind: who waits for answers has to learn why there are none
+        except Exception as error:  # any failure ends the thread: `stop` raises it for the owner
             self._error = error
             log.exception("the twin's %s failed", self.config.depth)
 
     def _serve(self, inlet: socket.socket) -> None:
-        deadline_s, owed = self._clock.now_s(), 0
+        deadline_s, due_steps = self._clock.now_s(), 0
         client = (self.config.client_host, self.config.state_port)
         while not self._end.is_set():
-            self._listen(inlet, deadline_s)
+            self._receive_until(inlet, deadline_s)
             late_s = self._clock.now_s() - deadline_s
-            # What is later than this is dropped: the world slows down then, and never bursts.
+            # A delay beyond the limit is dropped: the world then slows down, and never bursts.
             deadline_s += CONTROL_PERIOD_S + max(late_s - _MAX_CATCH_UP_S, 0.0)
-            owed += 1
-            if owed == _STEPS_AT_ONCE[self.config.depth]:
-                for _ in range(owed):
+            due_steps += 1
+            if due_steps == _STEPS_PER_WAKE[self.config.depth]:
+                for _ in range(due_steps):
                     self.twin.tick()
                     self.twin.world.step()
-                owed = 0
+                due_steps = 0
                 self._on_step()
-            self._send(inlet, self.twin.tell(), client)
+            self._send(inlet, self.twin.reply(), client)
 
-    def _listen(self, inlet: socket.socket, until_s: float) -> None:
-        if self.config.depth == "controller":  # what comes meanwhile is answered afterwards anyway
+    def _receive_until(self, inlet: socket.socket, until_s: float) -> None:
+        if self.config.depth == "controller":  # datagrams received meanwhile are answered afterwards anyway
             self._clock.sleep_until(until_s)
         while (left_s := until_s - self._clock.now_s()) > 0.0:
             if select.select([inlet], [], [], left_s)[0]:
-                self._hear(inlet)
-        self._hear(inlet)
+                self._receive(inlet)
+        self._receive(inlet)
 
-    def _hear(self, inlet: socket.socket) -> None:
-        for _ in range(_MOST_AT_ONCE):
+    def _receive(self, inlet: socket.socket) -> None:
+        for _ in range(_MAX_DATAGRAMS):
             try:
                 size, sender = inlet.recvfrom_into(self._buffer)
             except BlockingIOError:
                 break
-            except OSError:  # an answer of before reached nobody; the next datagram is still there
+            except OSError:  # an earlier answer was undeliverable; the next datagram is still queued
                 continue
-            self._send(inlet, self.twin.hear(self._buffer[:size]), sender)
+            self._send(inlet, self.twin.receive(self._buffer[:size]), sender)
 
     def _send(self, inlet: socket.socket, data: bytes | None, to: tuple[str, int]) -> None:
         if data is None:
@@ -199,14 +199,11 @@ class WireServer:
             inlet.sendto(data, to)
             self.answers += 1
         except OSError as error:
-            log.debug("an answer could not leave: %s", error)
+            log.debug("an answer could not be sent: %s", error)
 
 
-def _hurry() -> None:
-    """Ask for real time for this thread, as a controller of its own would have it; go on without what is not permitted.
-
-    Below the servo's thread, which waits for the answers.
-    """
+def _request_real_time() -> None:
+    """Request real-time scheduling for this thread, as a controller's own computer has it, where it is permitted."""
     if sys.platform == "linux":
         with contextlib.suppress(OSError):
             os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_FIFO_PRIORITY))

@@ -1,4 +1,4 @@
-"""The RealSense D405 behind the camera contract; the twin's goes the same way, through librealsense."""
+"""RealSense D405 behind the camera contract; the twin's camera, too, runs through librealsense."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 from importlib import import_module
 from typing import Any
 
-from hal.backends.d405.recovery import ResetLadder, Rung, StampKeeper
-from hal.backends.d405.session import D405CameraConfig, D405Session, RawFrame, find_device, why_not_found
+from hal.backends.d405.recovery import RecoveryPolicy, RecoveryStep, StampConverter
+from hal.backends.d405.session import D405CameraConfig, D405Session, RawFrame, describe_missing, find_device
 from hal.base.clock import Clock, WallClock, unix_offset_s
 from hal.base.d405 import FrameSource
 from hal.base.errors import CameraError, HalTimeoutError, NotConnectedError
@@ -17,40 +17,40 @@ from hal.base.messages import Intrinsics, RgbdFrame
 
 logger = logging.getLogger(__name__)
 
-_LOOK_EVERY_S = 0.25
+_POLL_S = 0.25  # between two checks of a silent camera, and of the bus [s]
 
 
 @dataclass(slots=True, kw_only=True)
 class CameraHealth:
-    """What a camera has been through since it was connected."""
+    """Counts of frames and recoveries since the camera was connected."""
 
     frames: int = 0
-    """Handed out."""
+    """Frames delivered."""
     repeated: int = 0
-    """Thrown away: the same frame once more."""
+    """Frames discarded as repetitions of the last one."""
     stale: int = 0
-    """Thrown away: older than `max_age_s`."""
+    """Frames discarded as older than `max_age_s`."""
     torn: int = 0
-    """Thrown away: colour and depth of different instants."""
+    """Frames discarded for colour and depth of different instants."""
     restarts: int = 0
-    """Of the streams."""
+    """Restarts of the streams."""
     resets: int = 0
-    """Of the hardware."""
-    found_again: int = 0
-    """After it had left the bus."""
+    """Resets of the hardware."""
+    reconnections: int = 0
+    """Returns to the bus."""
 
 
 class D405Camera:
     """`hal.base.camera.Camera` of a D405, for one thread.
 
     Both images of a frame share the pinhole of the depth image, which keeps its pixels; colour is undistorted onto it,
-    black where the imager does not reach. When frames stop, waiting for one also repairs: the streams are started
-    anew, then the hardware is reset, then the device is looked for on the bus until it is back.
+    black where the imager does not reach. When frames stop, waiting for one also recovers the camera: the streams are
+    restarted, then the hardware is reset, then the device is searched for on the bus until it is back.
 
     Args:
-        config: what to stream.
-        clock: by which frames are stamped and time-outs counted; by default the source's, or the wall's.
-        source: the optics of a twin, to be used instead of a real camera.
+        config: streams and timeouts.
+        clock: source of stamps and timeouts; by default the source's, or the wall clock.
+        source: optics of a twin that replaces the real camera.
     """
 
     def __init__(
@@ -73,15 +73,15 @@ class D405Camera:
         """Find the camera, start its streams, and let it warm up.
 
         Raises:
-            SdkMissingError: there is no librealsense for this machine.
-            HalTimeoutError: no such camera is on the bus, or it gives no frame.
-            CameraError: it will not stream what is wanted.
+            SdkMissingError: no librealsense on this machine.
+            HalTimeoutError: no such camera on the bus, or no frame from it.
+            CameraError: the camera rejects the requested streams.
         """
         if self._undo is not None:
             return
         config = self.config
         self.health = CameraHealth()
-        self._ladder, self._stamps = ResetLadder(config.silence_s), StampKeeper(config.max_age_s)
+        self._recovery, self._stamps = RecoveryPolicy(config.silence_s), StampConverter(config.max_age_s)
         self._last_number, self._sequence, self._offset = -1, 0, 0
         self._rs = import_module("hal.compat.realsense")
         with ExitStack() as undo:
@@ -104,7 +104,7 @@ class D405Camera:
 
     @property
     def intrinsics(self) -> Intrinsics:
-        """Of both images of every frame.
+        """Pinhole of both images of every frame.
 
         Raises:
             NotConnectedError: before `connect()`.
@@ -120,7 +120,7 @@ class D405Camera:
 
         Raises:
             NotConnectedError: before `connect()`.
-            HalTimeoutError: none came within `timeout_s` [s]; the message says what is being done about it.
+            HalTimeoutError: no frame within `timeout_s` [s]; the message names the recovery under way.
         """
         self._require_connection()
         return self._next(timeout_s)
@@ -129,8 +129,8 @@ class D405Camera:
         """Set exposure time [µs] and gain from now on, also after a reset; None for both = automatic.
 
         Raises:
-            NotConnectedError: before `connect()`, or while the camera is away.
-            ValueError: out of range.
+            NotConnectedError: before `connect()`, or while the camera is off the bus.
+            InvalidValueError: out of range.
         """
         self._require_connection()
         self.config = replace(self.config, exposure_us=exposure_us, gain=gain)
@@ -144,31 +144,33 @@ class D405Camera:
             before_s, session = self.clock.now_s(), self._session
             raw = None
             if session is not None:
-                raw = session.wait(min(left_s, _LOOK_EVERY_S))
+                raw = session.wait(min(left_s, _POLL_S))
             else:
-                self.clock.sleep_until(before_s + min(left_s, _LOOK_EVERY_S))
-            stamp_s = self._judge(session, raw) if session is not None and raw is not None else None
+                self.clock.sleep_until(before_s + min(left_s, _POLL_S))
+            stamp_s = self._validate(session, raw) if session is not None and raw is not None else None
             if stamp_s is not None and session is not None and raw is not None:
-                self._ladder.heard()
+                self._recovery.on_frame()
                 if stamp_s >= called_s - 1e-9:
                     return self._compose(session, raw, stamp_s)
             else:
-                self._climb(self._ladder.silent(self.clock.now_s() - before_s))
-        raise HalTimeoutError(f"no frame within {timeout_s:g} s from the D405 {self._serial}: {self._what_is_wrong()}.")
+                self._recover(self._recovery.on_silence(self.clock.now_s() - before_s))
+        raise HalTimeoutError(
+            f"D405 {self._serial}: no frame within {timeout_s:g} s: {self._describe_recovery()}.", code="no_frame"
+        )
 
-    def _judge(self, session: D405Session, raw: RawFrame) -> float | None:
-        """Return when a frame was exposed [s]; None when it is of no use."""
+    def _validate(self, session: D405Session, raw: RawFrame) -> float | None:
+        """Return the exposure time of a frame [s]; None when the frame is discarded."""
         if raw.number == self._last_number:
             self.health.repeated += 1
             return None
         if session.is_torn(raw):
             self.health.torn += 1
             return None
-        stamp_s = self._stamps.stamp(raw.device_s, unix_offset_s(self.clock), self.clock.now_s())
+        stamp_s = self._stamps.convert(raw.device_s, unix_offset_s(self.clock), self.clock.now_s())
         if stamp_s is None:
             self.health.stale += 1
             return None
-        if raw.number < self._last_number or self._last_number < 0:  # the device has begun to count anew
+        if raw.number < self._last_number or self._last_number < 0:  # the device has restarted its count
             self._offset = self._sequence + 1 - raw.number
         self._last_number = raw.number
         return stamp_s
@@ -186,46 +188,47 @@ class D405Camera:
             serial=session.serial,
         )
 
-    def _climb(self, rung: Rung | None) -> None:
-        if rung is None:
+    def _recover(self, step: RecoveryStep | None) -> None:
+        if step is None:
             return
         session = self._session
         if session is not None:
-            logger.warning("the D405 %s is silent: %s", self._serial, rung.value)
+            logger.warning("D405 %s: no frames; %s", self._serial, step.value)
         try:
-            if rung is Rung.RESTART and session is not None:
+            if step is RecoveryStep.RESTART and session is not None:
                 self.health.restarts += 1
                 self._reopen()
-            elif rung is Rung.RESET and session is not None:
+            elif step is RecoveryStep.RESET and session is not None:
                 self.health.resets += 1
                 session.device.hardware_reset()
                 self._close()
             else:
                 self._reopen()
-        # One attempt of several: what went wrong is said, and the next rung follows.
+        # One step of several: its failure is logged, and the next one follows.
         except (RuntimeError, CameraError) as error:
-            logger.warning("that failed: %s", error)
+            logger.warning("D405 %s: that failed: %s", self._serial, error)
 
     def _reopen(self) -> None:
-        was_away = self._session is None
+        was_lost = self._session is None
         self._close()
         device = find_device(self._rs, self._serial)
         if device is None:
-            self._ladder.lost()
+            self._recovery.on_lost()
             return
         self._open(device)
-        if was_away:
-            self.health.found_again += 1
-            self._ladder.found()
+        if was_lost:
+            self.health.reconnections += 1
+            self._recovery.on_found()
 
     def _find(self) -> Any:
         end_s = self.clock.now_s() + self.config.search_s
         while (device := find_device(self._rs, self._serial)) is None:
             if self.clock.now_s() >= end_s:
                 raise HalTimeoutError(
-                    f"no camera within {self.config.search_s:g} s: {why_not_found(self._rs, self._serial)}"
+                    f"D405: no camera within {self.config.search_s:g} s: {describe_missing(self._rs, self._serial)}",
+                    code="no_camera",
                 )
-            self.clock.sleep_until(min(self.clock.now_s() + _LOOK_EVERY_S, end_s))
+            self.clock.sleep_until(min(self.clock.now_s() + _POLL_S, end_s))
         return device
 
     def _open(self, device: Any) -> None:
@@ -238,11 +241,11 @@ class D405Camera:
         if session is not None:
             session.stop()
 
-    def _what_is_wrong(self) -> str:
-        rung = self._ladder.rung
-        if rung is None:
-            return "it streams, but nothing of use came in that time"
-        return f"it fell silent, and {rung.value}"
+    def _describe_recovery(self) -> str:
+        step = self._recovery.step
+        if step is None:
+            return "it streams, but no valid frame arrived in that time"
+        return f"its frames stopped, and {step.value}"
 
     def _require_connection(self) -> None:
         if self._undo is None:

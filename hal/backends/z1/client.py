@@ -1,7 +1,7 @@
-"""The conversation with the vendor's controller: one command out, whatever came in, and requests for states.
+"""Client of the vendor's controller: commands out, answers in, state requests.
 
-Nothing a peer sends raises an error here: what is wrong is counted and dropped, and its silence shows in the age of
-the newest answer.
+Nothing a peer sends raises an error here: invalid datagrams are counted and dropped, and a silent peer shows in the
+age of the newest answer.
 """
 
 from __future__ import annotations
@@ -25,97 +25,101 @@ from hal.z1_protocol.controller import (
 )
 from hal.z1_protocol.link import DatagramLink
 from hal.z1_protocol.records import JointCommands, ProtocolError
-from hal.z1_protocol.states import Fsm, granted
+from hal.z1_protocol.states import Fsm, is_granted
 
 ANSWER_MAX_AGE_S = 0.1
-"""The newest answer must not be older [s]; the controller answers within 2 ms."""
+"""Maximum age of the newest answer [s]; the controller answers within 2 ms."""
 
-_WAYS = {
+_REMEDIES = {
     Fsm.LOWCMD: "LOWCMD is entered from PASSIVE only.",
-    Fsm.PASSIVE: "Wait until it has done what it does.",
+    Fsm.PASSIVE: "Wait for the end of its present motion.",
 }
-_WAY = "Bring it to JOINTCTRL first."
-_MOST_AT_ONCE = 1024
+_DEFAULT_REMEDY = "Bring it to JOINTCTRL first."
+# Bounds one call of `receive`, so that a flood of datagrams cannot keep the servo from its next tick.
+_MAX_DATAGRAMS = 1024
+# An answer is an outlier when a joint moved by more than the first, plus the second times the time since the last one.
 _JUMP_RAD = 0.1
 _JUMP_SPEED = 3.0 * float(DQ_MAX.max())
-_LEFT_TIMES = 3
-_LAST_REFUSAL_CHARS = 200
+# Answers sent before a request was granted still arrive after it: one alone is no state change.
+_LEFT_COUNT = 3
+_MAX_REASON_CHARS = 200
 
 
 @dataclass(slots=True, kw_only=True)
-class Counts:
-    """What became of the datagrams since `open`."""
+class DatagramCounts:
+    """Datagrams since `open`, by outcome."""
 
     sent: int = 0
     """Commands sent."""
     unsent: int = 0
     """Commands that could not leave this machine."""
     answers: int = 0
-    """Answers that were used."""
+    """Valid answers."""
     repeats: int = 0
     """Of these, exact repetitions of the one before (half of them on a real arm: its board runs at 250 Hz)."""
-    refused: int = 0
-    """Datagrams that were no answers: wrong size, head or values."""
+    invalid: int = 0
+    """Datagrams with a wrong size, head or value."""
     jumps: int = 0
     """Answers dropped because a joint cannot have moved so far so fast."""
 
 
 class Z1Client:
-    """One client of one controller; the caller sees to it that one thread at a time is inside.
+    """Client of one controller; it has no lock of its own: its owner admits one thread at a time.
 
     Args:
-        link: the way to the controller.
-        clock: what time it is.
+        link: datagram link to the controller.
+        clock: source of time.
     """
 
     def __init__(self, link: DatagramLink, clock: Clock) -> None:
         self.link = link
         self.clock = clock
         self.command = CommandBuffer()
-        """What `send` sends."""
+        """The command that `send` sends."""
         self._reset()
 
     def _reset(self) -> None:
-        self.counts = Counts()
+        self.counts = DatagramCounts()
         self.faults = FaultLatch()
-        self.last_refusal = ""
-        """Why a datagram was refused last; empty when none was."""
+        self.invalid_reason = ""
+        """Reason for the last invalid datagram; empty without any."""
         self.expected: Fsm | None = None
-        """The state the controller is left alone in; another one, unasked, is a fault."""
+        """State in which the controller was left; another one, unrequested, is a fault."""
         self.cancelled = False
-        """Set by another thread: whoever waits for something here gives up at once."""
-        self._left_times = 0
-        self._been: set[Fsm] = set()
+        """Set by another thread, without the lock: every wait in here ends at once."""
+        self._left_count = 0
+        self._visited: set[Fsm] = set()
         self._newest: ControllerState | None = None
         self.newest_s = self.changed_s = self.sent_s = -np.inf
-        """When the newest answer came, when a measurement last changed, when the last command left [s]."""
+        """Times of the newest answer, of the last change of a measurement, and of the last command sent [s]."""
         self._raw = b""
-        self._candidate: np.ndarray | None = None
+        self._outlier: np.ndarray | None = None
 
-    # --- Life ---------------------------------------------------------------------------------------------------
+    # --- Connection -----------------------------------------------------------------------------------------------
 
     def open(self, timeout_s: float) -> None:
-        """Open the link and wait for an answer; the question changes no state.
+        """Open the link and wait for an answer; the command sent requests no state change.
 
         Raises:
-            HalTimeoutError: nobody answers in `timeout_s` [s]; the link is closed again.
+            HalTimeoutError: no answer within `timeout_s` [s]; the link is closed again.
             HalError: the link cannot be opened.
         """
         self._reset()
         self.link.open()
-        # A controller that a dead client left in LOWCMD obeys every datagram: this one brakes until more is known.
-        self.command.head(Fsm.INVALID, track=False)
+        # A controller that a crashed client left in LOWCMD executes every datagram: this one brakes.
+        self.command.set_head(Fsm.INVALID, track=False)
         self.command.joints[:] = 0
         self.command.joints["kd"] = KD_LOWCMD
         if self.exchange_until(lambda: self._newest is not None, timeout_s):
             return
-        tried = self.link.describe()
+        peer = self.link.describe()
         self.link.close()
-        heard = f"{self.counts.refused} datagrams came that are no answers, the last one because {self.last_refusal}"
+        received = f"{self.counts.invalid} invalid datagrams received, the last one: {self.invalid_reason}"
         raise HalTimeoutError(
-            f"no Z1 controller answers at {tried}; waited {timeout_s} s, "
-            f"{heard if self.counts.refused else 'nothing came'}. Switch the arm on, check its cable, and start the "
-            f"vendor's `z1_ctrl` on that machine, or the twin with `./z1 twin wire`."
+            f"Z1: no controller answers at {peer} within {timeout_s} s; "
+            f"{received if self.counts.invalid else 'nothing was received'}. Switch the arm on, check its cable, and "
+            f"start the vendor's `z1_ctrl` on that machine, or the twin with `./z1 twin wire`.",
+            code="no_controller",
         )
 
     def close(self) -> None:
@@ -133,8 +137,8 @@ class Z1Client:
 
     @property
     def has_left(self) -> bool:
-        """Whether the last three answers say that the controller is not in the expected state."""
-        return self._left_times >= _LEFT_TIMES
+        """Whether the last three answers report another state than the expected one."""
+        return self._left_count >= _LEFT_COUNT
 
     def send(self, data: bytes | bytearray | None = None) -> None:
         """Send `command`, or these bytes instead."""
@@ -145,22 +149,22 @@ class Z1Client:
         self.sent_s = self.clock.now_s()
 
     def receive(self, timeout_s: float = 0.0) -> bool:
-        """Take all that came, waiting up to `timeout_s` [s] if nothing did; say whether there was an answer."""
+        """Process all received datagrams, waiting up to `timeout_s` [s] for the first; return whether one was valid."""
         answered = False
-        for _ in range(_MOST_AT_ONCE):
+        for _ in range(_MAX_DATAGRAMS):
             data = self.link.receive(0.0 if answered else timeout_s)
             if data is None:
                 break
-            answered |= self._take(data)
+            answered |= self._process(data)
         return answered
 
     def discard(self) -> None:
-        """Throw away all that came."""
-        for _ in range(_MOST_AT_ONCE):
+        """Discard all received datagrams."""
+        for _ in range(_MAX_DATAGRAMS):
             if self.link.receive() is None:
                 break
 
-    def _take(self, data: memoryview) -> bool:
+    def _process(self, data: memoryview) -> bool:
         now_s = self.clock.now_s()
         state = self._newest
         if state is not None and data == self._raw:
@@ -169,10 +173,10 @@ class Z1Client:
             try:
                 state = decode_state(data)
             except ProtocolError as error:
-                self.counts.refused += 1
-                self.last_refusal = str(error)[:_LAST_REFUSAL_CHARS]
+                self.counts.invalid += 1
+                self.invalid_reason = str(error)[:_MAX_REASON_CHARS]
                 return False
-            if self._jumped(state.joints.q, now_s):
+            if self._is_outlier(state.joints.q, now_s):
                 self.counts.jumps += 1
                 return False
             self.changed_s = now_s
@@ -180,81 +184,87 @@ class Z1Client:
         self.newest_s = now_s
         self.counts.answers += 1
         self.faults.update(state.joints, now_s)
-        self._been.add(state.state)
-        self._watch(state.state, now_s)
+        self._visited.add(state.state)
+        self._check_state(state.state, now_s)
         return True
 
-    def _jumped(self, q: np.ndarray, now_s: float) -> bool:
-        """Whether a joint is where it cannot be; the second answer that says so is believed."""
+    def _is_outlier(self, q: np.ndarray, now_s: float) -> bool:
+        """Return whether a joint cannot have moved there; a second answer that confirms it is accepted."""
         if self._newest is None:
             return False
         reach = _JUMP_RAD + _JUMP_SPEED * (now_s - self.newest_s)
         if (np.abs(q - self._newest.joints.q) <= reach).all():
-            self._candidate = None
+            self._outlier = None
             return False
-        if self._candidate is not None and (np.abs(q - self._candidate) <= reach).all():
-            self._candidate = None
+        if self._outlier is not None and (np.abs(q - self._outlier) <= reach).all():
+            self._outlier = None
             return False
-        self._candidate = q
+        self._outlier = q
         return True
 
-    def _watch(self, state: Fsm, now_s: float) -> None:
+    def _check_state(self, state: Fsm, now_s: float) -> None:
         if self.expected is None or state is self.expected:
-            self._left_times = 0
+            self._left_count = 0
             return
-        self._left_times += 1
+        self._left_count += 1
         if self.has_left:
-            self.faults.note(f"the controller went from {self.expected.name} to {state.name} unasked", now_s)
+            self.faults.add(
+                f"the controller changed from {self.expected.name} to {state.name} without a request", now_s
+            )
 
-    # --- Requests ----------------------------------------------------------------------------------------------------
+    # --- Requests -------------------------------------------------------------------------------------------------
 
-    def ask(
-        self, asked: Fsm, body: JointCommands | TrajectoryCommand | str | None = None, *, timeout_s: float = 0.3
+    def request_state(
+        self, requested: Fsm, body: JointCommands | TrajectoryCommand | str | None = None, *, timeout_s: float = 0.3
     ) -> None:
-        """Ask for a state until the controller is in it; then keep asking for nothing, with the same body.
+        """Request a state until the controller is in it; from then on request no change, with the same body.
 
         Raises:
-            CommandRejectedError: it does not go there, or not from where it is.
+            CommandRejectedError: the controller ignores the request, or the transition is not allowed.
             HalTimeoutError: it stopped answering.
         """
-        was = self.newest.state
+        present = self.newest.state
         self.expected = None
-        if not granted(was, asked):
+        if not is_granted(present, requested):
             raise CommandRejectedError(
-                f"the controller is in {was.name}, from where it does not go to {asked.name}. {_WAYS.get(asked, _WAY)}"
+                f"Z1: the controller does not change from {present.name} to {requested.name}. "
+                f"{_REMEDIES.get(requested, _DEFAULT_REMEDY)}",
+                code="transition_not_allowed",
             )
-        request = encode_command(asked, body)
-        self._been.clear()
-        if not self.exchange_until(lambda: asked in self._been, timeout_s, request):
-            self.check_answers()
+        request = encode_command(requested, body)
+        self._visited.clear()
+        if not self.exchange_until(lambda: requested in self._visited, timeout_s, request):
+            self.check_age()
             raise CommandRejectedError(
-                f"the controller stays in {self.newest.state.name} when asked for {asked.name} for {timeout_s} s: it "
-                f"cannot do that (an unknown label, a pose out of reach), or it is there already."
+                f"Z1: the controller stays in {self.newest.state.name} after {timeout_s} s of requests for "
+                f"{requested.name}: the request is not possible (unknown label, pose out of reach) or already done.",
+                code="request_ignored",
             )
         self.command.data[:] = encode_command(Fsm.INVALID, body)
 
-    def wait_for(self, state: Fsm, timeout_s: float) -> None:
-        """Go on exchanging until the controller is in `state`.
+    def wait_for_state(self, state: Fsm, timeout_s: float) -> None:
+        """Exchange datagrams until the controller is in `state`.
 
         Raises:
-            HalTimeoutError: it is not after `timeout_s` [s], or stopped answering.
+            HalTimeoutError: it is not after `timeout_s` [s], or it stopped answering.
         """
         if not self.exchange_until(lambda: self.newest.state is state, timeout_s):
-            self.check_answers()
+            self.check_age()
             raise HalTimeoutError(
-                f"the controller is in {self.newest.state.name} after {timeout_s} s; expected was {state.name}."
+                f"Z1: the controller is in {self.newest.state.name} after {timeout_s} s; expected is {state.name}.",
+                code="state_timeout",
             )
 
     def exchange_until(self, reached: Callable[[], bool], timeout_s: float, data: bytes | None = None) -> bool:
-        """Exchange at the control rate until `reached`, or for `timeout_s` [s]; say whether it was.
+        """Exchange at the control rate until `reached`, or for `timeout_s` [s]; return whether it was reached.
 
         Raises:
-            CommandRejectedError: somebody set `cancelled`.
+            CommandRejectedError: `cancelled` was set.
         """
         end_s = self.clock.now_s() + timeout_s
         while self.clock.now_s() < end_s:
             if self.cancelled:
-                raise CommandRejectedError("a stop came in between.")
+                raise CommandRejectedError("Z1: the request was interrupted by a stop.", code="cancelled")
             self.send(data)
             self.clock.sleep_until(self.sent_s + CONTROL_PERIOD_S)
             self.receive()
@@ -262,15 +272,16 @@ class Z1Client:
                 return True
         return False
 
-    def check_answers(self) -> None:
-        """Raise when the newest answer is too old.
+    def check_age(self) -> None:
+        """Check the age of the newest answer.
 
         Raises:
-            HalTimeoutError: it is.
+            HalTimeoutError: it is older than `ANSWER_MAX_AGE_S`.
         """
         age_s = self.clock.now_s() - self.newest_s
         if age_s > ANSWER_MAX_AGE_S:
             raise HalTimeoutError(
-                f"the controller at {self.link.describe()} has not answered for {age_s:.2f} s; allowed is "
-                f"{ANSWER_MAX_AGE_S} s. Its program or its machine is gone: start it again, then connect again."
+                f"Z1: the controller at {self.link.describe()} has not answered for {age_s:.2f} s (allowed "
+                f"{ANSWER_MAX_AGE_S} s). Restart `z1_ctrl` or its machine, then connect again.",
+                code="stale_state",
             )

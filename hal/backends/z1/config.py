@@ -1,4 +1,4 @@
-"""How the real Z1 is reached and used, and what it tells about itself."""
+"""Configuration and diagnostics of the real Z1's driver."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from hal.backends.z1.client import Counts
+from hal.backends.z1.client import DatagramCounts
 from hal.backends.z1.faults import Fault
 from hal.base.errors import InvalidValueError
 from hal.z1_protocol.controller import COMMAND_PORT, STATE_PORT
@@ -15,10 +15,10 @@ from hal.z1_protocol.states import Fsm
 
 
 class Z1Mode(StrEnum):
-    """How the arm is commanded."""
+    """Command mode of the arm."""
 
     OBSERVE = "observe"
-    """Not at all: it is only looked at."""
+    """No commands: only measurements are read."""
     TRACKING = "tracking"
     """JOINTCTRL: the controller's own position servo, with its gravity compensation."""
     LOW_LEVEL = "low_level"
@@ -27,7 +27,7 @@ class Z1Mode(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Z1ArmConfig:
-    """Where the controller is and how to use it."""
+    """Address of the controller, and the mode to use it in."""
 
     host: str = "127.0.0.1"
     """The machine that runs `z1_ctrl`."""
@@ -38,9 +38,9 @@ class Z1ArmConfig:
     state_port: int = STATE_PORT
     """The port of this machine that it answers to; a second arm has another pair."""
     mode: Z1Mode = Z1Mode.TRACKING
-    """What `connect` brings the arm into."""
+    """Mode after `connect`."""
     connect_timeout_s: float = 2.0
-    """How long to wait for the first answer [s]."""
+    """Timeout of the first answer [s]."""
 
     def __post_init__(self) -> None:
         for name in ("command_port", "state_port"):
@@ -53,21 +53,21 @@ class Z1ArmConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Z1Diagnostics:
-    """How arm and conversation are doing."""
+    """Health of the arm and of the connection to its controller."""
 
     fsm: Fsm
-    """What the controller is doing."""
+    """State of the controller."""
     pose: np.ndarray
-    """(6,) roll, pitch, yaw [rad] and x, y, z [m] of the gripper pivot, as the controller says."""
+    """(6,) roll, pitch, yaw [rad] and x, y, z [m] of the gripper pivot, as the controller reports."""
     temperatures_c: np.ndarray
     """(8,) of the motors [°C]: joint1, both of joint2, joint3 to joint6, gripper."""
     faults: tuple[Fault, ...]
-    """Every fault since the last `clear_faults`, whether it is still there or not."""
+    """Every fault since the last `clear_faults`, present or past."""
     answer_age_s: float
     """Age of the newest answer [s]."""
     unchanged_s: float
-    """For how long the controller has repeated the same measurement [s]; long while moving = its board is silent."""
-    counts: Counts
-    """What became of the datagrams."""
-    last_refusal: str
-    """Why a datagram was refused last; empty when none was."""
+    """Duration for which the controller has repeated one measurement [s]; long while moving = its board is silent."""
+    counts: DatagramCounts
+    """Datagrams by outcome."""
+    invalid_reason: str
+    """Reason for the last invalid datagram; empty without any."""

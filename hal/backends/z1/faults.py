@@ -1,4 +1,4 @@
-"""What a Z1's motors complain about: in words, for as long as it lasts, and remembered until somebody looks."""
+"""Motor fault decoding and latching."""
 
 from __future__ import annotations
 
@@ -9,86 +9,86 @@ import numpy as np
 from hal.base import z1
 from hal.z1_protocol.records import JointStates, MotorError, MotorLink
 
-SHOWN_S = 0.5
-"""A fault is reported until so long after it was last seen [s]: nobody who looks now and then misses it."""
+REPORT_S = 0.5
+"""A fault is reported for this long after its last occurrence [s], so that a client polling at 2 Hz gets every one."""
 
-_DOUBLE = 1
+_DOUBLE = 1  # joint2 has two motors
 _SINGLE = [joint for joint in range(z1.N_JOINTS) if joint != _DOUBLE]
 _MOTOR_AT = [2 * joint for joint in range(z1.N_JOINTS)]
 _MOTOR_AT.insert(_DOUBLE + 1, 2 * _DOUBLE + 1)
-_ERROR_TIMES = 2
-_LINK_TIMES = 10
+# The motor electronics report every single datagram lost on their bus: one is no fault, ten (20 ms) are.
+_ERROR_COUNT = 2
+_LINK_COUNT = 10
 _IGNORED = int(MotorError.IGNORE)
-_ERROR_WORDS = {
+_ERROR_NAMES = {
     int(MotorError.OVER_CURRENT): "over-current",
     int(MotorError.LEAKAGE): "leakage current",
     int(MotorError.OVERHEAT): "overheat",
     int(MotorError.PARAMETER_JUMP): "parameter jump",
 }
-_LINK_WORDS = {int(MotorLink.LOST): "motor lost", int(MotorLink.CRC_ERROR): "CRC errors"}
+_LINK_NAMES = {int(MotorLink.LOST): "motor lost", int(MotorLink.CRC_ERROR): "CRC errors"}
 
 
 class Fault(NamedTuple):
-    """A fault that was seen."""
+    """One fault and the times at which it occurred."""
 
-    words: str
+    text: str
     """For instance "joint2 motor 2: overheat"."""
     first_s: float
-    """When it was first seen [s]."""
+    """First occurrence [s]."""
     last_s: float
-    """When it was last seen [s]."""
+    """Last occurrence [s]."""
 
 
 class FaultLatch:
-    """Turns motor records into faults and keeps them.
+    """Faults decoded from motor records, kept until they are cleared.
 
-    An error bit counts when two measurements in a row have it, a lost or garbled motor after ten (20 ms): the arm
-    board reports every single datagram that it missed on its bus.
+    An error bit counts when two measurements in a row have it, a lost or garbled motor after ten (20 ms).
     """
 
     def __init__(self) -> None:
         shape = (z1.N_JOINTS, 2)
-        self._error_times = np.zeros((*shape, 8), dtype=np.int32)
-        self._link_times = np.zeros(shape, dtype=np.int32)
-        self._seen: dict[str, Fault] = {}
+        self._error_counts = np.zeros((*shape, 8), dtype=np.int32)
+        self._link_counts = np.zeros(shape, dtype=np.int32)
+        self._faults: dict[str, Fault] = {}
 
     def update(self, joints: JointStates, now_s: float) -> None:
-        """Take a measurement of `now_s` [s]."""
+        """Evaluate a measurement of `now_s` [s]."""
         error, link = joints.error & ~np.uint8(_IGNORED), joints.link.copy()
         error[_SINGLE, 1] = link[_SINGLE, 1] = 0  # only joint 2 has a second motor
         if not (error.any() or link.any()):
-            if self._error_times.any() or self._link_times.any():
-                self._error_times[:] = 0
-                self._link_times[:] = 0
+            if self._error_counts.any() or self._link_counts.any():
+                self._error_counts[:] = 0
+                self._link_counts[:] = 0
             return
         bits = np.unpackbits(error[..., None], axis=-1, bitorder="little")
-        self._error_times = (self._error_times + 1) * bits
-        self._link_times = (self._link_times + 1) * (link != 0)
-        for joint, motor, bit in np.argwhere(self._error_times >= _ERROR_TIMES):
-            word = _ERROR_WORDS.get(1 << int(bit), f"unknown error 0x{1 << int(bit):02x}")
-            self.note(f"{_name(joint, motor)}: {word}", now_s)
-        for joint, motor in np.argwhere(self._link_times >= _LINK_TIMES):
+        self._error_counts = (self._error_counts + 1) * bits
+        self._link_counts = (self._link_counts + 1) * (link != 0)
+        for joint, motor, bit in np.argwhere(self._error_counts >= _ERROR_COUNT):
+            name = _ERROR_NAMES.get(1 << int(bit), f"unknown error 0x{1 << int(bit):02x}")
+            self.add(f"{_motor_name(joint, motor)}: {name}", now_s)
+        for joint, motor in np.argwhere(self._link_counts >= _LINK_COUNT):
             state = int(link[joint, motor])
-            self.note(f"{_name(joint, motor)}: {_LINK_WORDS.get(state, f'unknown link state {state}')}", now_s)
+            self.add(f"{_motor_name(joint, motor)}: {_LINK_NAMES.get(state, f'unknown link state {state}')}", now_s)
 
-    def note(self, words: str, now_s: float) -> None:
-        """Take a fault of another kind, seen at `now_s` [s]."""
-        first_s = self._seen[words].first_s if words in self._seen else now_s
-        self._seen[words] = Fault(words, first_s, now_s)
+    def add(self, text: str, now_s: float) -> None:
+        """Latch a fault that occurs at `now_s` [s]."""
+        first_s = self._faults[text].first_s if text in self._faults else now_s
+        self._faults[text] = Fault(text, first_s, now_s)
 
-    def shown(self, now_s: float) -> tuple[str, ...]:
-        """Return the faults present at `now_s` [s], or until `SHOWN_S` ago, in words."""
-        if not self._seen:
+    def active(self, now_s: float) -> tuple[str, ...]:
+        """Return the texts of the faults present at `now_s` [s], or until `REPORT_S` before."""
+        if not self._faults:
             return ()
-        return tuple(fault.words for fault in self._seen.values() if now_s - fault.last_s <= SHOWN_S)
+        return tuple(fault.text for fault in self._faults.values() if now_s - fault.last_s <= REPORT_S)
 
     def latched(self) -> tuple[Fault, ...]:
         """Return every fault since the last `clear`, oldest first."""
-        return tuple(sorted(self._seen.values(), key=lambda fault: fault.first_s))
+        return tuple(sorted(self._faults.values(), key=lambda fault: fault.first_s))
 
     def clear(self) -> None:
-        """Forget what was seen; what is still there is seen again."""
-        self._seen.clear()
+        """Clear the latch; faults that persist are latched again."""
+        self._faults.clear()
 
 
 def motor_values(values: np.ndarray) -> np.ndarray:
@@ -96,6 +96,6 @@ def motor_values(values: np.ndarray) -> np.ndarray:
     return values.ravel()[_MOTOR_AT]
 
 
-def _name(joint: int, motor: int) -> str:
+def _motor_name(joint: int, motor: int) -> str:
     name = z1.JOINT_NAMES[joint]
     return f"{name} motor {motor + 1}" if joint == _DOUBLE else name

@@ -1,7 +1,7 @@
-"""`pyrealsense2` with a digital twin for a camera: `import hal.compat.realsense as rs`, and the code stays as it was.
+"""`pyrealsense2` with a digital twin as a camera: `import hal.compat.realsense as rs`, without other changes.
 
-All of it is librealsense itself. With nothing plugged in by `plug`, its classes see the real cameras on USB; with a
-twin plugged in, they see the twin alone, as a D405 through librealsense's own `software_device`.
+All of it is librealsense itself. Without a twin plugged in by `plug`, its classes find the real cameras on USB; with
+one, they find only the twin, as a D405 through librealsense's own `software_device`.
 """
 
 from hal.compat.realsense.library import *  # noqa: F403 - every public name of pyrealsense2

@@ -1,9 +1,9 @@
-"""The classes of pyrealsense2 that must know of twins; everything else is librealsense's own.
+"""Classes of pyrealsense2 with support for twins; everything else is librealsense's own.
 
-Names and arguments are librealsense's. Facts about the native classes that shape this file: `pipeline.set_device` gives
-a pipeline a device for good and makes it deaf to serial numbers and files in a `config`; a `context` cannot be taught a
-device from Python. The texts of errors are the library's. In lock-step, frames come to those who wait for a pipeline or
-a queue it was started with; callbacks and syncers need free run.
+Names, arguments and error texts are librealsense's. Two facts about the native classes shape this file:
+`pipeline.set_device` binds a pipeline to a device for good and makes it ignore serial numbers and files in a `config`;
+a device cannot be added to a `context` from Python. In lock-step, frames are made by waiting for a pipeline, or for a
+queue that it was started with; callbacks and syncers need free run.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ _NO_DEVICE = "No device connected"
 
 
 class config(rs.config):
-    """Remembers what the native one does not tell."""
+    """Configuration that keeps the values that the native one does not return."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.wanted_serial: str | None = None
+        self.requested_serial: str | None = None
         self.is_file = False
-        self.wants_all = False
+        self.all_streams = False
 
     def enable_device(self, serial: str) -> None:
         super().enable_device(serial)
-        self.wanted_serial = serial
+        self.requested_serial = serial
 
     def enable_device_from_file(self, file_name: str, repeat_playback: bool = True) -> None:
         super().enable_device_from_file(file_name, repeat_playback)
@@ -37,11 +37,11 @@ class config(rs.config):
 
     def enable_all_streams(self) -> None:
         super().enable_all_streams()
-        self.wants_all = True
+        self.all_streams = True
 
     def disable_all_streams(self) -> None:
         super().disable_all_streams()
-        self.wants_all = False
+        self.all_streams = False
 
     def resolve(self, p: pipeline_wrapper) -> rs.pipeline_profile:
         return super().resolve(rs.pipeline_wrapper(p.pipeline.prepare(self)))
@@ -54,7 +54,7 @@ class config(rs.config):
 
     def name_all_streams(self) -> None:
         """Name each stream of `enable_all_streams`, which finds none on a `software_device`."""
-        if not self.wants_all:
+        if not self.all_streams:
             return
         super().disable_all_streams()
         super().enable_stream(rs.stream.depth)
@@ -64,7 +64,7 @@ class config(rs.config):
 
 
 class pipeline_wrapper(rs.pipeline_wrapper):
-    """Remembers its pipeline."""
+    """Wrapper that keeps its pipeline."""
 
     def __init__(self, p: pipeline) -> None:
         super().__init__(p)
@@ -72,27 +72,27 @@ class pipeline_wrapper(rs.pipeline_wrapper):
 
 
 class pipeline(rs.pipeline):
-    """Streams from a twin, where one is plugged in, from a real camera otherwise, and from files."""
+    """Pipeline of a twin where one is plugged in, of a real camera otherwise, and of files."""
 
     def __init__(self, ctx: rs.context | None = None) -> None:
         super().__init__(*() if ctx is None else (ctx,))
-        self._engine: rs.pipeline = self  # which native pipeline streams
+        self._engine: rs.pipeline = self  # native pipeline that streams
         self._twin: TwinDevice | None = None
         self._had_twin = False
         self._streams = False
 
     def start(self, *args, **kwargs) -> rs.pipeline_profile:
         options = [*args, *kwargs.values()]
-        wish = next((option for option in options if isinstance(option, rs.config)), None)
+        request = next((option for option in options if isinstance(option, rs.config)), None)
         queue = next((option for option in options if isinstance(option, frame_queue)), None)
-        if not self._streams:  # else the library says what is wrong
-            self._engine = self.prepare(wish)
-            self._twin = None if self._engine is not self else _twin_for(wish)
+        if not self._streams:  # else the library raises its own error
+            self._engine = self.prepare(request)
+            self._twin = None if self._engine is not self else _twin_for(request)
         twin = self._twin
-        if twin is not None and twin.source.lockstep and queue is None and len(options) > (wish is not None):
+        if twin is not None and twin.source.lockstep and queue is None and len(options) > (request is not None):
             raise RuntimeError(
-                "a twin in lock-step makes frames when they are waited for, so nothing would call a callback; "
-                "wait for frames, start with a hal.compat.realsense.frame_queue, or run the twin on the wall's clock."
+                "a twin in lock-step makes frames on demand, so a callback would never be called; wait for frames, "
+                "start with a hal.compat.realsense.frame_queue, or run the twin on the wall clock."
             )
         with self._guard():
             profile = rs.pipeline.start(self._engine, *args, **kwargs)
@@ -116,12 +116,12 @@ class pipeline(rs.pipeline):
             frames = self._pull(timeout_ms)
             if frames:
                 return frames
-            raise RuntimeError(self._why_late(timeout_ms))
+            raise RuntimeError(self._describe_timeout(timeout_ms))
         try:
             return rs.pipeline.wait_for_frames(self._engine, timeout_ms)
         except RuntimeError as error:
             if self._streams and self._twin is not None and not self._twin.present:
-                raise RuntimeError(self._why_late(timeout_ms)) from error
+                raise RuntimeError(self._describe_timeout(timeout_ms)) from error
             raise
 
     def try_wait_for_frames(self, timeout_ms: int = 5000) -> tuple[bool, rs.composite_frame]:
@@ -133,18 +133,18 @@ class pipeline(rs.pipeline):
     def poll_for_frames(self) -> rs.composite_frame:
         return self._pull(1000) if self._lockstep() else rs.pipeline.poll_for_frames(self._engine)
 
-    def prepare(self, wish: rs.config | None) -> rs.pipeline:
-        """Return the native pipeline that will do what `wish` says, with the right device.
+    def prepare(self, request: rs.config | None) -> rs.pipeline:
+        """Return the native pipeline for `request`, bound to the right device.
 
         Raises:
-            RuntimeError: the camera asked for is not there.
+            RuntimeError: the requested camera is not connected.
         """
-        if isinstance(wish, config) and wish.is_file:
+        if isinstance(request, config) and request.is_file:
             return rs.pipeline()
-        twin = _twin_for(wish)
+        twin = _twin_for(request)
         if twin is not None:
-            if isinstance(wish, config):
-                wish.name_all_streams()
+            if isinstance(request, config):
+                request.name_all_streams()
             self.set_device(twin.handle)
             self._had_twin = True
         elif self._had_twin:
@@ -155,7 +155,7 @@ class pipeline(rs.pipeline):
         return self._streams and self._twin is not None and self._twin.source.lockstep
 
     def _pull(self, timeout_ms: int) -> rs.composite_frame:
-        """Let the twin go on until it has frames or the time is over; return them, or an empty set."""
+        """Step the twin until it has frames or the timeout is over; return them, or an empty set."""
         assert self._twin is not None
         clock = self._twin.source.clock
         end_s = clock.now_s() + 1e-3 * timeout_ms
@@ -165,7 +165,7 @@ class pipeline(rs.pipeline):
             frames = rs.pipeline.poll_for_frames(self._engine)
         return frames
 
-    def _why_late(self, timeout_ms: int) -> str:
+    def _describe_timeout(self, timeout_ms: int) -> str:
         if self._twin is not None and not self._twin.present:
             return f"Device disconnected. Failed to reconnect: {_NO_DEVICE}{timeout_ms}"
         return f"Frame didn't arrive within {timeout_ms}"
@@ -175,7 +175,7 @@ class pipeline(rs.pipeline):
 
 
 class frame_queue(rs.frame_queue):
-    """In lock-step, waiting for a frame makes it."""
+    """Queue that steps a twin in lock-step while it is waited for."""
 
     def __init__(self, capacity: int = 1, keep_frames: bool = False) -> None:
         super().__init__(capacity, keep_frames)
@@ -192,7 +192,7 @@ class frame_queue(rs.frame_queue):
         return super().poll_for_frame()
 
     def _pull(self, timeout_ms: int) -> int:
-        """Let a twin in lock-step go on until it has a frame or the time is over; return what is left to wait [ms]."""
+        """Step a twin in lock-step until it has a frame or the timeout is over; return the remaining time [ms]."""
         if self.twin is None or not self.twin.source.lockstep:
             return timeout_ms
         clock = self.twin.source.clock
@@ -203,7 +203,7 @@ class frame_queue(rs.frame_queue):
 
 
 class context(rs.context):
-    """Finds the twins that are plugged in, or else the real cameras."""
+    """Context with the twins plugged in, or else the real cameras."""
 
     def query_devices(self, mask: int | None = None) -> rs.device_list:
         if port.twins():
@@ -230,7 +230,7 @@ class context(rs.context):
 
 
 class device_list(list):
-    """Acts as the library's own, which cannot be made from Python."""
+    """Replacement of the library's own, which cannot be constructed in Python."""
 
     def size(self) -> int:
         return len(self)
@@ -256,15 +256,15 @@ class device_list(list):
         return self[index]
 
 
-def _twin_for(wish: rs.config | None) -> TwinDevice | None:
-    """Return the twin that `wish` names, or the first; None when none is plugged in.
+def _twin_for(request: rs.config | None) -> TwinDevice | None:
+    """Return the twin that `request` names, or the first; None without any.
 
     Raises:
-        RuntimeError: that one is not there.
+        RuntimeError: that twin is not present.
     """
     if not port.twins():
         return None
-    serial = getattr(wish, "wanted_serial", None)
+    serial = getattr(request, "requested_serial", None)
     for twin in port.twins():
         if twin.present and serial in (None, twin.serial):
             return twin

@@ -1,4 +1,4 @@
-"""What librealsense is told about a D405 that is not there: identity, options, profiles, optics."""
+"""Description of a twin D405 for librealsense: identity, options, profiles, optics."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from hal.base.d405 import D405Calibration
 from hal.base.messages import Intrinsics
 from hal.compat.realsense.library import native as rs
 
-_PICTURES = {
+_COLOUR_FORMATS = {
     rs.format.rgb8: (3, None),
     rs.format.bgr8: (3, cv2.COLOR_RGB2BGR),
     rs.format.rgba8: (4, cv2.COLOR_RGB2RGBA),
@@ -18,10 +18,10 @@ _PICTURES = {
 }
 FORMATS = {
     (rs.stream.depth, 0): {rs.format.z16: (2, None)},
-    (rs.stream.color, 0): {**_PICTURES, rs.format.yuyv: (2, cv2.COLOR_RGB2YUV_YUY2)},
+    (rs.stream.color, 0): {**_COLOUR_FORMATS, rs.format.yuyv: (2, cv2.COLOR_RGB2YUV_YUY2)},
     (rs.stream.infrared, 1): {rs.format.y8: (1, cv2.COLOR_RGB2GRAY)},
     (rs.stream.infrared, 2): {rs.format.y8: (1, cv2.COLOR_RGB2GRAY)},
-    (rs.stream.infrared, 0): {**_PICTURES, rs.format.uyvy: (2, cv2.COLOR_RGB2YUV_UYVY)},
+    (rs.stream.infrared, 0): {**_COLOUR_FORMATS, rs.format.uyvy: (2, cv2.COLOR_RGB2YUV_UYVY)},
 }
 """(stream, index) to format to (bytes a pixel, OpenCV's conversion from RGB)."""
 
@@ -29,7 +29,7 @@ _DEFAULTS = {
     (848, 480, 30, rs.stream.depth, rs.format.z16),
     (848, 480, 30, rs.stream.color, rs.format.rgb8),
 }
-"""What streams when nothing is asked for."""
+"""Default profiles."""
 
 _OPTIONS = {
     rs.option.exposure: (*d405.EXPOSURE_US, 1),
@@ -48,11 +48,11 @@ _OPTIONS = {
     rs.option.visual_preset: (0, 6, 0, 1),
     rs.option.global_time_enabled: (0, 1, 1, 1),
 }
-"""Lowest, highest, default, step. Exposure, gain and auto-exposure change the twin's pictures; the rest are kept."""
+"""Minimum, maximum, default, step. Exposure, gain and auto-exposure change the twin's images; the rest are stored."""
 
 
-def describe(handle, serial: str, calibration: D405Calibration):
-    """Give a `software_device` all that a D405 tells of itself; return its sensor."""
+def add_sensor(handle, serial: str, calibration: D405Calibration):
+    """Add the identity and the sensor of a D405 to a `software_device`; return the sensor."""
     sensor = handle.add_sensor(d405.SENSOR)
     _register_identity(handle, serial)
     _add_options(sensor)
@@ -80,9 +80,9 @@ def _register_identity(handle, serial: str) -> None:
 
 
 def _add_options(sensor) -> None:
-    for option, (lowest, highest, default, step) in _OPTIONS.items():
-        limits = rs.option_range()  # its constructor takes step and default the wrong way round
-        limits.min, limits.max, limits.step, limits.default = lowest, highest, step, default
+    for option, (minimum, maximum, default, step) in _OPTIONS.items():
+        limits = rs.option_range()  # its constructor swaps step and default
+        limits.min, limits.max, limits.step, limits.default = minimum, maximum, step, default
         sensor.add_option(option, limits, True)
     sensor.add_read_only_option(rs.option.asic_temperature, d405.ASIC_C)
     sensor.add_read_only_option(rs.option.depth_units, d405.DEPTH_UNIT_M)
@@ -90,7 +90,7 @@ def _add_options(sensor) -> None:
 
 
 def _add_profiles(sensor, calibration: D405Calibration) -> None:
-    """Add every profile of the D405; a request that leaves something open takes the first that fits."""
+    """Add every profile of the D405; an incomplete request gets the first that fits."""
     added: dict[tuple, list] = {key: [] for key in FORMATS}
     for width, height in d405.MIN_Z_M:
         rectified = _optics(calibration.depth(width, height), rs.distortion.brown_conrady, (0.0,) * 5)
@@ -119,7 +119,7 @@ def _optics(pinhole: Intrinsics, model, coeffs: tuple[float, ...]):
 def _register_extrinsics(added: dict[tuple, list], calibration: D405Calibration) -> None:
     first = added[rs.stream.depth, 0][0]
     for (stream, index), profiles in added.items():
-        pose = rs.extrinsics()  # of the depth axes seen from the stream's
+        pose = rs.extrinsics()  # of the depth axes in the stream's
         rotation = calibration.R_colour_depth if stream == rs.stream.color else np.eye(3)
         pose.rotation = rotation.ravel(order="F").tolist()
         pose.translation = [-d405.BASELINE_M if index == 2 else 0.0, 0.0, 0.0]

@@ -1,4 +1,4 @@
-"""librealsense's own Python module, or what to do where it cannot be had."""
+"""librealsense's own Python module, or an error with the remedy where it is missing."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from hal.libusb import preload as _preload
 
 try:
     _preload()
-    import pyrealsense2 as native  # noqa: F401 - the unchanged module, for what is built upon it
+    import pyrealsense2 as native  # noqa: F401 - the unchanged module, for the twin
     from pyrealsense2 import *  # noqa: F403 - re-exported under the same names
     from pyrealsense2 import __full_version__, __version__  # noqa: F401 - re-exported too
 except ImportError as _error:

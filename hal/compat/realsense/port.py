@@ -1,18 +1,15 @@
-"""Where twins are plugged in, and what librealsense's own classes do for a twin that its `software_device` cannot."""
+"""Registry of the twins plugged in, and patches of librealsense's classes for gaps of its `software_device`."""
 
 from __future__ import annotations
 
 import atexit
-import logging
-import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 
 from hal.base.d405 import FrameSource
 from hal.compat.realsense.device import SERIAL, TwinDevice
 from hal.compat.realsense.library import native as rs
-
-logger = logging.getLogger(__name__)
+from hal.masquerade import masquerade_module
 
 _twins: list[TwinDevice] = []
 _watchers: list[Callable] = []
@@ -21,25 +18,25 @@ _SWITCHES_OFF_AUTO_EXPOSURE = (rs.option.exposure, rs.option.gain)
 
 
 def plug(source: FrameSource, serial: str = SERIAL) -> TwinDevice:
-    """Let librealsense find a twin with these optics, and no other camera than twins, until it is unplugged.
+    """Make a twin with these optics visible to librealsense, which finds only twins until it is unplugged.
 
     Raises:
         ValueError: a twin with that serial number is plugged in already.
     """
     if any(twin.serial == serial for twin in _twins):
-        raise ValueError(f"a twin with serial number {serial} is plugged in already; give each its own.")
+        raise ValueError(f"D405 twin: serial number {serial} is plugged in already; give each twin its own.")
     if not _twins:
         rs.device.hardware_reset, rs.options.set_option = _reset_device, _set_option_as_d405
-        atexit.register(_unplug_all)  # no thread may be inside the library when Python ends
+        atexit.register(_unplug_all)  # no thread may run inside the library when Python exits
     twin = TwinDevice(source, serial)
-    twin.on_presence = lambda present: _tell_watchers(twin, present)
+    twin.on_presence = lambda present: _notify_watchers(twin, present)
     _twins.append(twin)
     twin.start()
     return twin
 
 
 def unplug(twin: TwinDevice) -> None:
-    """Take a twin out again; harmless when it is out. What it streamed falls silent."""
+    """Unplug a twin, which ends its streams. Harmless when unplugged."""
     if twin not in _twins:
         return
     _twins.remove(twin)
@@ -61,20 +58,10 @@ def plugged(source: FrameSource, serial: str = SERIAL) -> Iterator[TwinDevice]:
         unplug(twin)
 
 
-@contextmanager
-def masquerade() -> Iterator[None]:
-    """Let `import pyrealsense2` give `hal.compat.realsense` for the length of a `with` block."""
+def masquerade() -> AbstractContextManager[None]:
+    """Make `import pyrealsense2` give `hal.compat.realsense` for the length of a `with` block."""
     names = ("pyrealsense2", "pyrealsense2.pyrealsense2")  # older programs import the second
-    before = {name: sys.modules.get(name) for name in names}
-    sys.modules |= dict.fromkeys(names, sys.modules["hal.compat.realsense"])
-    try:
-        yield
-    finally:
-        for name, module in before.items():
-            if module is None:
-                del sys.modules[name]
-            else:
-                sys.modules[name] = module
+    return masquerade_module("hal.compat.realsense", *names)
 
 
 def twins() -> list[TwinDevice]:
@@ -88,7 +75,7 @@ def watch(callback: Callable) -> None:
 
 
 class PresenceEvent:
-    """What `set_devices_changed_callback` hands over; the library's own cannot be made from Python."""
+    """Event of `set_devices_changed_callback`; the library's own cannot be constructed in Python."""
 
     def __init__(self, handle, present: bool) -> None:
         self._handle, self._present = handle, present
@@ -103,7 +90,7 @@ class PresenceEvent:
         return [self._handle] if self._present else []
 
 
-def _tell_watchers(twin: TwinDevice, present: bool) -> None:
+def _notify_watchers(twin: TwinDevice, present: bool) -> None:
     for callback in tuple(_watchers):
         callback(PresenceEvent(twin.handle, present))
 
@@ -114,7 +101,7 @@ def _unplug_all() -> None:
 
 
 def _serial(info) -> str:
-    """Return the serial number of a device or sensor, or nothing."""
+    """Return the serial number of a device or sensor; empty without one."""
     return info.get_info(rs.camera_info.serial_number) if info.supports(rs.camera_info.serial_number) else ""
 
 

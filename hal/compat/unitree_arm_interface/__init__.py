@@ -1,7 +1,7 @@
 """`unitree_arm_interface` without the vendor's library: its scripts run on any Python, on the arm or on the twin.
 
-`import hal.compat.unitree_arm_interface as unitree_arm_interface` in a script of one's own; `with masquerade():` or
-`install()` before one that says `import unitree_arm_interface` and must stay as it is.
+New scripts use `import hal.compat.unitree_arm_interface as unitree_arm_interface`; unmodified ones, which use
+`import unitree_arm_interface`, run after `install()` or inside `with masquerade():`.
 """
 
 from hal.compat.unitree_arm_interface.arm import ArmInterface as ArmInterface

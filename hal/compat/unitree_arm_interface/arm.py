@@ -1,4 +1,4 @@
-"""The vendor's `ArmInterface` on top of our driver: same names, same order of things, and limits that it never had."""
+"""The vendor's `ArmInterface` on top of our driver: same names and call order, with limits that it lacks."""
 
 from __future__ import annotations
 
@@ -24,29 +24,29 @@ from hal.z1_protocol.states import MOVES, Fsm
 
 log = logging.getLogger(__name__)
 
-_COMPLAIN_EVERY_S = 1.0
-_CARTESIAN_TIMEOUT_S = 0.5
+_LOG_PERIOD_S = 1.0  # of repeated errors of the loop
+_CARTESIAN_TIMEOUT_S = 0.5  # a script that ends must not leave the arm moving
 _GRIPPER_SPEED = 1.0
-_MAX_ORIENTATION_SPEED, _MAX_POSITION_SPEED = 0.6, 0.3
+_MAX_ORIENTATION_SPEED, _MAX_POSITION_SPEED = 0.6, 0.3  # [rad/s], [m/s]
 _MAX_LINEAR_SPEED = 1.0
 
 
 class ArmInterface:
-    """A Z1 as the vendor's Python module presents it.
+    """A Z1 with the interface of the vendor's Python module.
 
-    What differs, for safety: every command is within the limits of position, speed and torque; CARTESIAN tracking is
-    done here and sent as joint positions, and ends 0.5 s after the last `cartesianCtrlCmd`; a state that cannot be
-    reached is an error in the log and `False`, not an endless wait; `labelRun` and `backToStart` go through JOINTCTRL
-    when they must.
+    Differences, for safety: every command is within the limits of position, speed and torque; CARTESIAN tracking is
+    computed here and sent as joint positions, and ends 0.5 s after the last `cartesianCtrlCmd`; an unreachable state
+    is an error in the log and `False`, not an endless wait; `labelRun` and `backToStart` pass through JOINTCTRL where
+    necessary.
 
     Args:
-        hasGripper: whether the gripper's mass belongs to the model.
+        hasGripper: whether the model has the gripper's mass.
     """
 
     make_arm: Callable[[Z1ArmConfig], Z1Arm] = staticmethod(lambda config: Z1Arm(WallClock(), config))
-    """How the driver is made; a test or another clock may replace it."""
+    """Factory of the driver; replaceable, for a test or another clock."""
     udp = UDPPort()
-    """Where the controller of a new interface is."""
+    """Address of the controller of a new interface."""
 
     def __init__(self, hasGripper: bool = True) -> None:
         model = Z1Model.with_gripper() if hasGripper else Z1Model()
@@ -62,23 +62,23 @@ class ArmInterface:
         self._track: Fsm | None = None
         self._rates = np.zeros(6)
         self._rates_until_s = 0.0
-        self._complained_s = -np.inf
+        self._logged_s = -np.inf
 
     # --- Communication ----------------------------------------------------------------------------------------------
 
     @property
     def _arm(self) -> Z1Arm:
-        """The driver, connected when it is first needed, so that `udp` can be chosen before.
+        """The driver, connected at its first use, so that `udp` can be set before.
 
         Raises:
-            HalError: nobody answers, or somebody else talks to the controller.
+            HalError: no answer, or another program uses the port.
         """
         if self._made is None:
             udp: UDPPort = self._ctrlComp.udp
             made = self.make_arm(replace(udp.config, mode=Z1Mode.OBSERVE))
             made.connect()
             self._made = made
-            self.lowstate.take(made.newest)
+            self.lowstate.update(made.newest)
             atexit.register(self._close)
         return self._made
 
@@ -98,7 +98,7 @@ class ArmInterface:
             self._thread.start()
 
     def loopOff(self) -> None:
-        """End that; the arm holds."""
+        """End the loop of `loopOn`; the arm holds."""
         if self._thread is not None:
             self._end.set()
             self._thread.join()
@@ -111,45 +111,47 @@ class ArmInterface:
             try:
                 self.sendRecv()
             except (HalError, ValueError) as error:
-                if clock.now_s() - self._complained_s > _COMPLAIN_EVERY_S:
-                    self._complained_s = clock.now_s()
+                if clock.now_s() - self._logged_s > _LOG_PERIOD_S:
+                    self._logged_s = clock.now_s()
                     log.error("%s", error)
             deadline_s = max(deadline_s + self._ctrlComp.dt, clock.now_s())
             clock.sleep_until(deadline_s)
 
     def sendRecv(self) -> None:
-        """Send the command of the present state and take what came; for loops of one's own, with `loopOff`.
+        """Send the command of the present state and process the answers; for a script's own loop, after `loopOff`.
 
         Raises:
             HalError: the controller is silent, or does not follow.
-            ValueError: a command is not of finite numbers in the right shape.
+            ValueError: a command with a wrong shape or values that are not finite.
         """
         arm, mode, track = self._arm, self._arm.mode, self._track
         arm.read_state()
-        self.lowstate.take(arm.newest)
+        self.lowstate.update(arm.newest)
         try:
             if mode is Z1Mode.LOW_LEVEL:
                 arm.send_motors(self._motor_commands())
             elif track is not None and mode is Z1Mode.TRACKING:
                 if track is Fsm.CARTESIAN:
                     self._follow_rates(arm)
-                arm.send(ArmSetpoint(q=self._joined(self.q, self.gripperQ), dq=self._joined(self.qd, self.gripperQd)))
+                arm.send(ArmSetpoint(q=self._join(self.q, self.gripperQ), dq=self._join(self.qd, self.gripperQd)))
             else:
                 arm.idle()
         except CommandRejectedError:
-            if self._track is track and arm.mode is mode and not arm.moving:  # else another thread changed it meanwhile
+            if (
+                self._track is track and arm.mode is mode and not arm.moving
+            ):  # else another thread changed the mode meanwhile
                 raise
 
     @staticmethod
-    def _joined(values: ArrayLike, gripper: float) -> np.ndarray:
+    def _join(values: ArrayLike, gripper: float) -> np.ndarray:
         return np.append(np.asarray(values, dtype=float).reshape(z1.N_ARM), float(gripper))
 
     def _motor_commands(self) -> JointCommands:
         lowcmd = self._ctrlComp.lowcmd
         return JointCommands(
-            q=self._joined(self.q, self.gripperQ),
-            dq=self._joined(self.qd, self.gripperQd),
-            tau=self._joined(self.tau, self.gripperTau),
+            q=self._join(self.q, self.gripperQ),
+            dq=self._join(self.qd, self.gripperQd),
+            tau=self._join(self.tau, self.gripperTau),
             kp=np.array(lowcmd.kp, dtype=float),
             kd=np.array(lowcmd.kd, dtype=float),
         )
@@ -157,12 +159,12 @@ class ArmInterface:
     # --- States -----------------------------------------------------------------------------------------------------
 
     def getCurrentState(self) -> Fsm:
-        """Return what the controller is doing; CARTESIAN while we track a posture."""
+        """Return the controller's state; CARTESIAN while a posture is tracked."""
         state = self._arm.newest.state
         return Fsm.CARTESIAN if state is Fsm.JOINTCTRL and self._track is Fsm.CARTESIAN else state
 
     def setFsm(self, fsm: Fsm) -> bool:
-        """Change the state and wait for it; say whether it is reached. LOWCMD follows PASSIVE only."""
+        """Change the state and wait for it; return whether it was reached. LOWCMD follows PASSIVE only."""
         self._track = None
         arm = self._arm
         if fsm is Fsm.LOWCMD and arm.newest.state is not Fsm.PASSIVE:
@@ -177,41 +179,43 @@ class ArmInterface:
                     arm.go_passive()
                 case Fsm.JOINTCTRL | Fsm.CARTESIAN:
                     arm.enter(Z1Mode.TRACKING)
-                    self._take_over()
+                    self._reset_commands()
                     self._track = Fsm.CARTESIAN if fsm is Fsm.CARTESIAN else None
                 case Fsm.LOWCMD:
-                    self._take_over()  # before, too: the loop sends as soon as it may
+                    self._reset_commands()  # before entering, too: the loop sends as soon as it may
                     self._ctrlComp.lowcmd.setControlGain()
                     self._ctrlComp.lowcmd.setGripperGain()
                     arm.enter(Z1Mode.LOW_LEVEL)
-                    self._take_over()
+                    self._reset_commands()
                 case _:
                     arm.begin_move(fsm)
 
         return self._succeeds(change)
 
     def setFsmLowcmd(self) -> None:
-        """Go through PASSIVE to LOWCMD, where `q`, `qd`, `tau` and the gripper's start from the measurement, and end
-        the loop: from now on `sendRecv` is the script's to call."""
+        """Enter LOWCMD through PASSIVE and end the loop: from now on the script calls `sendRecv`.
+
+        `q`, `qd`, `tau` and the gripper's start from the measurement.
+        """
         self.loopOff()
         if self.setFsm(Fsm.PASSIVE):
             self.setFsm(Fsm.LOWCMD)
 
     def startTrack(self, fsm: Fsm) -> None:
-        """Start to follow `q` and `qd` (JOINTCTRL) or `cartesianCtrlCmd` (CARTESIAN), from where the arm is."""
+        """Start to track `q` and `qd` (JOINTCTRL) or `cartesianCtrlCmd` (CARTESIAN), from where the arm is."""
         if fsm not in (Fsm.JOINTCTRL, Fsm.CARTESIAN):
             log.error("startTrack takes JOINTCTRL or CARTESIAN, not %r.", fsm)
         elif self.setFsm(fsm):
             self._track = fsm
 
     def setWait(self, Y_N: bool) -> None:
-        """Choose whether MoveJ, MoveL, MoveC, labelRun, backToStart and teachRepeat wait for their end."""
+        """Set whether MoveJ, MoveL, MoveC, labelRun, backToStart and teachRepeat wait for their end."""
         self._wait = bool(Y_N)
 
-    def _take_over(self) -> None:
+    def _reset_commands(self) -> None:
         newest = self._arm.newest
         joints = newest.joints
-        self.lowstate.take(newest)
+        self.lowstate.update(newest)
         self._rates = np.zeros(6)
         self.q, self.qd, self.tau = joints.q[: z1.N_ARM].copy(), np.zeros(z1.N_ARM), np.zeros(z1.N_ARM)
         self.gripperQ, self.gripperQd, self.gripperTau = float(joints.q[z1.N_ARM]), 0.0, 0.0
@@ -240,11 +244,11 @@ class ArmInterface:
         return self._move(Fsm.SAVESTATE, label)
 
     def teach(self, label: str) -> bool:
-        """Let the arm be led by hand and record it under a label, until `setFsm(ArmFSMState.JOINTCTRL)`."""
+        """Record a motion guided by hand under a label, until `setFsm(ArmFSMState.JOINTCTRL)`."""
         return self._move(Fsm.TEACH, label, wait=False)
 
     def teachRepeat(self, label: str) -> bool:
-        """Play such a recording."""
+        """Replay a recording."""
         return self._move(Fsm.TEACHREPEAT, label)
 
     def calibration(self) -> bool:
@@ -256,7 +260,7 @@ class ArmInterface:
         """Move to a posture (6,) along joint space: `MoveJ(posture, [gripperPos,] maxSpeed)` with speed in rad/s.
 
         Returns:
-            Whether there are joints for the posture, and it was gone to.
+            Whether the posture is reachable, and the motion succeeded.
         """
         return self._go(Fsm.MOVEJ, [posture], arguments, float(z1.DQ_MAX[0]))
 
@@ -268,14 +272,16 @@ class ArmInterface:
         """Move along an arc: `MoveC(middlePosture, endPosture, [gripperPos,] maxSpeed)` with speed in m/s."""
         return self._go(Fsm.MOVEC, [middlePosture, endPosture], arguments, _MAX_LINEAR_SPEED)
 
-    def _go(self, fsm: Fsm, postures: list[ArrayLike], arguments: tuple[float, ...], fastest: float) -> bool:
+    def _go(self, fsm: Fsm, postures: list[ArrayLike], arguments: tuple[float, ...], max_speed: float) -> bool:
         if not 1 <= len(arguments) <= 2:
-            raise TypeError(f"after the postures come [gripperPos,] maxSpeed; {len(arguments)} arguments came.")
+            raise TypeError(
+                f"the postures are followed by [gripperPos,] maxSpeed; received {len(arguments)} arguments."
+            )
         *gripper, speed = arguments
         model = self._ctrlComp.armModel
         for posture in postures:
             if not model.inverseKinematics(postureToHomo(posture), self.lowstate.getQ(), True)[0]:
-                log.error("no joints within the limits reach the posture %s.", posture)
+                log.error("The posture %s is unreachable within the joint limits.", posture)
                 return False
         poses = np.zeros((2, 6))
         poses[: len(postures)] = postures
@@ -283,7 +289,7 @@ class ArmInterface:
         move = TrajectoryCommand(
             poses=poses,
             gripper_rad=float(np.clip(angle, z1.GRIPPER_OPEN, z1.GRIPPER_CLOSED)),
-            max_speed=float(np.clip(speed, 0.0, fastest)),
+            max_speed=float(np.clip(speed, 0.0, max_speed)),
         )
         return self._move(fsm, move)
 
@@ -305,21 +311,21 @@ class ArmInterface:
     # --- Commands ---------------------------------------------------------------------------------------------------
 
     def jointCtrlCmd(self, directions: ArrayLike, jointSpeed: float) -> None:
-        """Move `q` and `gripperQ` on by one period at `directions` (7,) of −1 … 1 times `jointSpeed` [rad/s]."""
+        """Advance `q` and `gripperQ` by one period at `directions` (7,) of −1 … 1 times `jointSpeed` [rad/s]."""
         speed = float(np.clip(jointSpeed, 0.0, z1.DQ_MAX[0]))
         step = np.clip(np.asarray(directions, dtype=float).reshape(z1.N_JOINTS), -1.0, 1.0) * speed
-        q = self._joined(self.q, self.gripperQ) + step * self._ctrlComp.dt
+        q = self._join(self.q, self.gripperQ) + step * self._ctrlComp.dt
         self._set(np.clip(q, z1.Q_MIN, z1.Q_MAX), step)
 
     def cartesianCtrlCmd(self, directions: ArrayLike, oriSpeed: float, posSpeed: float) -> None:
         """Change the posture at `directions` (7,) of −1 … 1 (roll, pitch, yaw, x, y, z, gripper) times `oriSpeed`
         [rad/s] up to 0.6 and `posSpeed` [m/s] up to 0.3; the gripper turns at 1 rad/s."""
-        ways = np.clip(np.asarray(directions, dtype=float).reshape(z1.N_JOINTS), -1.0, 1.0)
+        rate_ratios = np.clip(np.asarray(directions, dtype=float).reshape(z1.N_JOINTS), -1.0, 1.0)
         rates = np.repeat(
             [np.clip(oriSpeed, 0.0, _MAX_ORIENTATION_SPEED), np.clip(posSpeed, 0.0, _MAX_POSITION_SPEED)], 3
         )
-        self._rates = ways[:6] * rates
-        self.gripperQd = float(ways[6]) * _GRIPPER_SPEED
+        self._rates = rate_ratios[:6] * rates
+        self.gripperQd = float(rate_ratios[6]) * _GRIPPER_SPEED
         self._rates_until_s = self._arm.clock.now_s() + _CARTESIAN_TIMEOUT_S
 
     def setArmCmd(self, q: ArrayLike, qd: ArrayLike, tau: ArrayLike | None = None) -> None:
@@ -341,4 +347,4 @@ class ArmInterface:
             self._rates, self.gripperQd = np.zeros(6), 0.0
         qd = self._ctrlComp.armModel.end_speeds(self._rates, self.q, dt) if self._rates.any() else np.zeros(z1.N_ARM)
         speed = np.append(qd, self.gripperQd)
-        self._set(np.clip(self._joined(self.q, self.gripperQ) + dt * speed, z1.Q_MIN, z1.Q_MAX), speed)
+        self._set(np.clip(self._join(self.q, self.gripperQ) + dt * speed, z1.Q_MIN, z1.Q_MAX), speed)

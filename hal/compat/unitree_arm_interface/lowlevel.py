@@ -1,4 +1,4 @@
-"""The vendor's small classes: what the arm measures, what it is told in low-level mode, and where its controller is."""
+"""The vendor's small classes: measurements, commands of the low-level mode, and the controller's address."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from hal.z1_protocol.controller import COMMAND_PORT, KD_LOWCMD, KP_LOWCMD, STATE
 from hal.z1_protocol.states import Fsm
 
 ArmFSMState = Fsm
-"""The vendor's name of it."""
+"""The vendor's name of the controller's states."""
 RECVSTATE_LENGTH = STATE_SIZE
 _ARM = slice(z1.N_ARM)
 
 
 class BlockYN(IntEnum):
-    """Whether the vendor's port blocks; accepted and not needed."""
+    """Blocking mode of the vendor's port; accepted and ignored."""
 
     NO = 0
     YES = 1
@@ -30,7 +30,7 @@ class BlockYN(IntEnum):
 
 @dataclass(frozen=True)
 class UDPPort:
-    """Where a controller is; `arm._ctrlComp.udp = UDPPort("127.0.0.1", 8073, 8074)` before `loopOn` takes another."""
+    """Address of a controller; `arm._ctrlComp.udp = UDPPort("127.0.0.1", 8073, 8074)` before `loopOn` sets another."""
 
     IP: str = "127.0.0.1"
     toPort: int = COMMAND_PORT
@@ -41,25 +41,25 @@ class UDPPort:
 
     @property
     def config(self) -> Z1ArmConfig:
-        """The same for our driver; an arm that is not on this machine answers to any of its addresses."""
+        """Configuration of our driver; a controller on another machine answers to any of this one's addresses."""
         local = "127.0.0.1" if self.IP in ("127.0.0.1", "localhost") else "0.0.0.0"
         return Z1ArmConfig(host=self.IP, command_port=self.toPort, local_host=local, state_port=self.ownPort)
 
 
 class LowlevelState:
-    """What was measured last: seven joints, eight motors, and the gripper's posture."""
+    """Last measurement: seven joints, eight motors, and the gripper's posture."""
 
     def __init__(self) -> None:
         self.q, self.dq, self.ddq, self.tau = ([0.0] * z1.N_JOINTS for _ in range(4))
         self.temperature, self.errorstate, self.isMotorConnected = ([0] * (z1.N_JOINTS + 1) for _ in range(3))
         self.endPosture = np.zeros(6)
 
-    def take(self, state: ControllerState) -> None:
-        """Take over what the controller answered."""
+    def update(self, state: ControllerState) -> None:
+        """Update from an answer of the controller."""
         joints = state.joints
         self.q, self.dq, self.ddq, self.tau = (v.tolist() for v in (joints.q, joints.dq, joints.ddq, joints.tau))
         self.temperature = motor_values(joints.temperature_c).tolist()
-        self.errorstate = motor_values(joints.error & ~np.uint8(0x40)).tolist()  # a bit that means nothing
+        self.errorstate = motor_values(joints.error & ~np.uint8(0x40)).tolist()  # MotorError.IGNORE
         self.isMotorConnected = motor_values(joints.link).tolist()
         self.endPosture = state.pose.copy()
 
@@ -101,12 +101,12 @@ class LowlevelCmd:
         self.kp, self.kd = KP_LOWCMD.tolist(), KD_LOWCMD.tolist()
 
     def setControlGain(self, KP: Sequence[float] | None = None, KW: Sequence[float] | None = None) -> None:
-        """Set the arm's gains (6,); the usual ones without arguments."""
+        """Set the arm's gains (6,); the default ones without arguments."""
         self.kp[_ARM] = list(KP_LOWCMD[_ARM] if KP is None else KP)[_ARM]
         self.kd[_ARM] = list(KD_LOWCMD[_ARM] if KW is None else KW)[_ARM]
 
     def setGripperGain(self, KP: float | None = None, KW: float | None = None) -> None:
-        """Set the gripper's gains; the usual ones without arguments."""
+        """Set the gripper's gains; the default ones without arguments."""
         self.kp[z1.N_ARM] = float(KP_LOWCMD[z1.N_ARM] if KP is None else KP)
         self.kd[z1.N_ARM] = float(KD_LOWCMD[z1.N_ARM] if KW is None else KW)
 
@@ -119,24 +119,24 @@ class LowlevelCmd:
         self.kd = [0.0] * z1.N_JOINTS
 
     def setGripperZeroGain(self) -> None:
-        """Let the gripper go."""
+        """Release the gripper: no stiffness, no damping."""
         self.setGripperGain(0.0, 0.0)
 
 
 class RecvState:
-    """What the controller answered last."""
+    """Last answer of the controller."""
 
     def __init__(self, fsm: Callable[[], Fsm]) -> None:
         self._fsm = fsm
 
     @property
     def state(self) -> Fsm:
-        """What it is doing."""
+        """State of the controller."""
         return self._fsm()
 
 
 class CtrlComponents:
-    """What belongs to an `ArmInterface`."""
+    """Components of an `ArmInterface`."""
 
     def __init__(self, model: Z1Model, udp: UDPPort, recvState: RecvState) -> None:
         self.armModel = model

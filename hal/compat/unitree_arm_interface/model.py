@@ -8,29 +8,32 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+import pinocchio as pin  # pyright: ignore[reportMissingImports] - a .pth file leads to it
 
 from hal.base import z1
+from hal.base.z1_kinematics import pose_from_posture, posture_from_pose, solve_flange_pose
+from hal.base.z1_model import rigid_body_model
 
 ArrayLike = np.ndarray | Sequence[float]
 
 MOUNT_M = 0.051
-"""Where the gripper is mounted, along link06's x axis [m] (URDF)."""
+"""Position of the gripper's mount along link06's x axis [m] (URDF)."""
 PIVOT_M = float(z1.T_FLANGE_PIVOT[0, 3]) - MOUNT_M
-"""The vendor's gripper: its end-effector, the pivot, seen from there, along x [m]."""
+"""The vendor's end effector, the pivot, in the mount's frame, along x [m]."""
 
-_AROUND_RAD = 0.5
+_MAX_CHANGE_RAD = 0.5
 _SINGULAR_M = 0.1
-_DAMPING = 1e-4
+_DAMPING = 1e-4  # regularises the least squares at singularities only
 _GRAVITY_JOINT = 6
 _END = 6
 
 
 class Z1Model:
-    """Kinematics and dynamics of the arm and what is mounted at its end.
+    """Kinematics and dynamics of the arm and its end effector.
 
     Args:
-        endPosLocal: (3,) the end-effector's origin in the mount's frame [m]; None = at the mount.
-        endEffectorMass: of what is mounted there [kg].
+        endPosLocal: (3,) the end effector's origin in the mount's frame [m]; None = at the mount.
+        endEffectorMass: its mass [kg].
         endEffectorCom: (3,) its centre of mass in the mount's frame [m].
         endEffectorInertia: (3, 3) its inertia about that centre [kg m²].
     """
@@ -43,11 +46,6 @@ class Z1Model:
         endEffectorInertia: np.ndarray | None = None,
         /,
     ) -> None:
-        import pinocchio as pin  # pyright: ignore[reportMissingImports] - a .pth file leads to it
-
-        from hal.base.z1_model import rigid_body_model
-
-        self._pin = pin
         full = rigid_body_model()
         model = pin.buildReducedModel(full, [full.getJointId("jointGripper")], pin.neutral(full))
         flange = full.frames[full.getFrameId("link06")]
@@ -64,18 +62,16 @@ class Z1Model:
 
     @classmethod
     def with_gripper(cls) -> Z1Model:
-        """Return the model of the arm with its own gripper, closed, by the URDF's masses; its end is the pivot."""
+        """Return the model of the arm with its closed gripper, by the URDF's masses; its end effector is the pivot."""
         made = cls(np.array([PIVOT_M, 0.0, 0.0]))
-        from hal.base.z1_model import rigid_body_model
-
         full = rigid_body_model()
-        made._model = made._pin.buildReducedModel(full, [full.getJointId("jointGripper")], made._pin.neutral(full))
+        made._model = pin.buildReducedModel(full, [full.getJointId("jointGripper")], pin.neutral(full))
         made._data = made._model.createData()
         return made
 
     def _add(self, mass: float, com: np.ndarray, inertia: np.ndarray) -> None:
         if mass:
-            self._model.appendBodyToJoint(_GRAVITY_JOINT, self._pin.Inertia(mass, com, inertia), self._T_joint6_mount)
+            self._model.appendBodyToJoint(_GRAVITY_JOINT, pin.Inertia(mass, com, inertia), self._T_joint6_mount)
         self._data = self._model.createData()
 
     def addLoad(self, load: float) -> None:
@@ -92,8 +88,8 @@ class Z1Model:
             ValueError: wrong shape of `q`, or no such index.
         """
         if not 0 <= index <= _END:
-            raise ValueError(f"index is {index}; allowed are 0 to {_END}.")
-        self._pin.forwardKinematics(self._model, self._data, _vector(q, z1.N_ARM))
+            raise ValueError(f"the index is {index}; allowed is 0 to {_END}.")
+        pin.forwardKinematics(self._model, self._data, _vector(q, z1.N_ARM))
         if index == _END:
             return (self._data.oMi[_GRAVITY_JOINT] * self._T_joint6_end).homogeneous
         return self._data.oMi[index + 1].homogeneous
@@ -101,53 +97,41 @@ class Z1Model:
     def inverseKinematics(
         self, Tdes: np.ndarray, qPast: ArrayLike, checkInWorkSpace: bool = False, /
     ) -> tuple[bool, np.ndarray]:
-        """Find joints (6,) within the limits that put the end-effector at `Tdes` (4, 4).
+        """Return whether the end effector reaches `Tdes` (4, 4), and the joints (6,); `qPast` when it does not.
 
-        Of several, the nearest to `qPast` (6,) is taken. With `checkInWorkSpace` any of them will do, else no joint
-        may be further than 0.5 rad from it.
-
-        Returns:
-            Whether there are any, and they; `qPast` when not.
+        Of several solutions, the nearest to `qPast` (6,) is taken; without `checkInWorkSpace`, no joint may change by
+        more than 0.5 rad.
         """
-        from ssik.prebuilt.unitree import z1_ik  # compiles itself on import
-
         past = _vector(qPast, z1.N_ARM)
         T_base_flange = np.asarray(Tdes, dtype=float) @ self._T_flange_end.inverse().homogeneous
-        found = [solution.q for solution in z1_ik.solve(T_base_flange)]
-        low, high = z1.Q_MIN[: z1.N_ARM] - 1e-6, z1.Q_MAX[: z1.N_ARM] + 1e-6
-        found = [q for q in found if (q >= low).all() and (q <= high).all()]
-        if not found:
-            return False, past
-        nearest = min(found, key=lambda q: float(np.abs(q - past).max()))
-        if not checkInWorkSpace and np.abs(nearest - past).max() > _AROUND_RAD:
-            return False, past
-        return True, np.clip(nearest, z1.Q_MIN[: z1.N_ARM], z1.Q_MAX[: z1.N_ARM])
+        q = solve_flange_pose(T_base_flange, past, np.inf if checkInWorkSpace else _MAX_CHANGE_RAD)
+        return (False, past) if q is None else (True, q)
 
     def CalcJacobian(self, q: ArrayLike, /) -> np.ndarray:
         """Return the spatial Jacobian (6, 6): J @ qd is the end-effector's twist in the base frame, angular part first,
         with the velocity of the point at the base's origin."""
-        self._pin.computeJointJacobians(self._model, self._data, _vector(q, z1.N_ARM))
-        J = self._pin.getJointJacobian(self._model, self._data, _GRAVITY_JOINT, self._pin.ReferenceFrame.WORLD)
+        pin.computeJointJacobians(self._model, self._data, _vector(q, z1.N_ARM))
+        J = pin.getJointJacobian(self._model, self._data, _GRAVITY_JOINT, pin.ReferenceFrame.WORLD)
         return np.vstack([J[3:], J[:3]])
 
     def solveQP(self, twist: ArrayLike, qPast: ArrayLike, dt: float, /) -> np.ndarray:
-        """Return the joint speeds (6,) that come nearest to a spatial `twist` (6,), angular part first, from `qPast`
-        (6,) within the limits on speed and, after `dt` [s], on position; singular or not."""
+        """Return the joint speeds (6,) nearest to a spatial `twist` (6,), angular part first, from `qPast` (6,)
+        within the limits on speed and, after `dt` [s], on position; singular or not."""
         q = _vector(qPast, z1.N_ARM)
-        return self._bounded(self.CalcJacobian(q), _vector(twist, 6), q, dt)
+        return self._solve_speeds(self.CalcJacobian(q), _vector(twist, 6), q, dt)
 
     def end_speeds(self, rates: np.ndarray, q: np.ndarray, dt: float) -> np.ndarray:
         """Return the joint speeds (6,) under which the posture changes at `rates` (6,), within the same limits."""
         T = self.forwardKinematics(q)
         goal = postureToHomo(homoToPosture(T) + dt * rates)
-        angular = self._pin.log3(goal[:3, :3] @ T[:3, :3].T) / dt
+        angular = pin.log3(goal[:3, :3] @ T[:3, :3].T) / dt
         J = self.CalcJacobian(q)
         # From the velocity of the point at the origin to that of the end-effector.
         J[3:] += np.cross(J[:3], T[:3, 3], axisa=0, axisc=0)
-        return self._bounded(J, np.concatenate([angular, (goal[:3, 3] - T[:3, 3]) / dt]), q, dt)
+        return self._solve_speeds(J, np.concatenate([angular, (goal[:3, 3] - T[:3, 3]) / dt]), q, dt)
 
     @staticmethod
-    def _bounded(J: np.ndarray, twist: np.ndarray, q: np.ndarray, dt: float) -> np.ndarray:
+    def _solve_speeds(J: np.ndarray, twist: np.ndarray, q: np.ndarray, dt: float) -> np.ndarray:
         speed = z1.DQ_MAX[: z1.N_ARM]
         low = np.clip((z1.Q_MIN[: z1.N_ARM] - q) / dt, -speed, 0.0)
         high = np.clip((z1.Q_MAX[: z1.N_ARM] - q) / dt, 0.0, speed)
@@ -158,9 +142,9 @@ class Z1Model:
         from scipy.optimize import lsq_linear
 
         A = np.vstack([J, _DAMPING * np.eye(z1.N_ARM)])
-        wish = np.concatenate([twist, np.zeros(z1.N_ARM)])
-        # Equal bounds are not allowed: a joint at both ends of its range has no range.
-        return np.clip(lsq_linear(A, wish, (low - 1e-9, high + 1e-9)).x, low, high)
+        b = np.concatenate([twist, np.zeros(z1.N_ARM)])
+        # lsq_linear rejects equal bounds, as of a joint at its limit.
+        return np.clip(lsq_linear(A, b, (low - 1e-9, high + 1e-9)).x, low, high)
 
     # --- Dynamics ---------------------------------------------------------------------------------------------------
 
@@ -168,10 +152,10 @@ class Z1Model:
         """Return the joint torques (6,) [Nm] of a motion under gravity while the end-effector pushes with `Ftip` (6,):
         moment [Nm], then force [N], in its own frame."""
         angles, wrench = _vector(q, z1.N_ARM), _vector(Ftip, 6)
-        tau = self._pin.rnea(self._model, self._data, angles, _vector(qd, z1.N_ARM), _vector(qdd, z1.N_ARM)).copy()
+        tau = pin.rnea(self._model, self._data, angles, _vector(qd, z1.N_ARM), _vector(qdd, z1.N_ARM)).copy()
         if wrench.any():
-            self._pin.computeJointJacobians(self._model, self._data, angles)
-            J = self._pin.getJointJacobian(self._model, self._data, _GRAVITY_JOINT, self._pin.ReferenceFrame.LOCAL)
+            pin.computeJointJacobians(self._model, self._data, angles)
+            J = pin.getJointJacobian(self._model, self._data, _GRAVITY_JOINT, pin.ReferenceFrame.LOCAL)
             J_end = self._T_joint6_end.inverse().action @ J
             tau += J_end.T @ np.concatenate([wrench[3:], wrench[:3]])
         return tau
@@ -179,7 +163,7 @@ class Z1Model:
     # --- Limits -----------------------------------------------------------------------------------------------------
 
     def checkInSingularity(self, q: ArrayLike, /) -> bool:
-        """Whether joint 5 is within 0.1 m of joint 1's axis."""
+        """Return whether joint 5 is within 0.1 m of joint 1's axis."""
         x, y = self.forwardKinematics(q, 4)[:2, 3]
         return bool(x * x + y * y < _SINGULAR_M**2)
 
@@ -204,23 +188,12 @@ class Z1Model:
 
 def postureToHomo(posture: ArrayLike, /) -> np.ndarray:
     """Return the pose (4, 4) of a posture (6,)."""
-    roll, pitch, yaw, *position = _vector(posture, 6)
-    cr, sr, cp, sp, cy, sy = (f(angle) for angle in (roll, pitch, yaw) for f in (np.cos, np.sin))
-    T = np.eye(4)
-    T[:3, :3] = [
-        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
-        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
-        [-sp, cp * sr, cp * cr],
-    ]
-    T[:3, 3] = position
-    return T
+    return pose_from_posture(_vector(posture, 6))
 
 
 def homoToPosture(T: np.ndarray, /) -> np.ndarray:
     """Return the posture (6,) of a pose (4, 4)."""
-    R = np.asarray(T, dtype=float)
-    pitch = np.arctan2(-R[2, 0], np.hypot(R[0, 0], R[1, 0]))
-    return np.array([np.arctan2(R[2, 1], R[2, 2]), pitch, np.arctan2(R[1, 0], R[0, 0]), *R[:3, 3]])
+    return posture_from_pose(np.asarray(T, dtype=float))
 
 
 def _vector(values: ArrayLike | None, n: int) -> np.ndarray:
@@ -228,5 +201,5 @@ def _vector(values: ArrayLike | None, n: int) -> np.ndarray:
         return np.zeros(n)
     vector = np.array(values, dtype=float)
     if vector.shape != (n,) or not np.isfinite(vector).all():
-        raise ValueError(f"{n} finite numbers are needed; these are {values!r}.")
+        raise ValueError(f"the value is {values!r}; allowed are {n} finite numbers.")
     return vector

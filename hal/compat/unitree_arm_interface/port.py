@@ -1,28 +1,20 @@
-"""How `import unitree_arm_interface` comes to mean ours."""
+"""Substitution of the vendor's `unitree_arm_interface` by ours."""
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
+
+from hal.masquerade import install_module, masquerade_module
 
 _NAME = "unitree_arm_interface"
+_OURS = f"hal.compat.{_NAME}"
 
 
 def install() -> None:
-    """Let `import unitree_arm_interface` give ours from now on, whatever lies on the path."""
-    sys.modules[_NAME] = sys.modules[f"hal.compat.{_NAME}"]
+    """Make `import unitree_arm_interface` give ours from now on, whatever is installed under that name."""
+    install_module(_OURS, _NAME)
 
 
-@contextmanager
-def masquerade() -> Iterator[None]:
-    """Do so for the length of a `with` block."""
-    before = sys.modules.get(_NAME)
-    install()
-    try:
-        yield
-    finally:
-        if before is None:
-            del sys.modules[_NAME]
-        else:
-            sys.modules[_NAME] = before
+def masquerade() -> AbstractContextManager[None]:
+    """Substitute for the length of a `with` block, as `install` does."""
+    return masquerade_module(_OURS, _NAME)

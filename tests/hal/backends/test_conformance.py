@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 
 import numpy as np
 import pytest
+from _pytest.mark.structures import ParameterSet
 
 from hal.base.arm import Arm
 from hal.base.camera import Camera
@@ -15,7 +17,12 @@ from hal.base.z1 import N_ARM, N_JOINTS, Q_MAX, Q_MIN
 from tests.support.hal.conformance import ARM_CASES, CAMERA_CASES, ArmCase, CameraCase, drive
 
 
-@pytest.fixture(params=[make for _, make in ARM_CASES], ids=[name for name, _ in ARM_CASES])
+def params(cases: list[tuple[str, Callable[[], AbstractContextManager]]]) -> list[ParameterSet]:
+    """Return the cases as parameters; those over Zenoh run in real time."""
+    return [pytest.param(make, id=name, marks=[pytest.mark.integration] * (name == "remote")) for name, make in cases]
+
+
+@pytest.fixture(params=params(ARM_CASES))
 def case(request: pytest.FixtureRequest) -> Iterator[ArmCase]:
     with request.param() as made:
         yield made
@@ -28,7 +35,7 @@ def ready(case: ArmCase) -> ArmCase:
     return case
 
 
-@pytest.fixture(params=[make for _, make in CAMERA_CASES], ids=[name for name, _ in CAMERA_CASES])
+@pytest.fixture(params=params(CAMERA_CASES))
 def view(request: pytest.FixtureRequest) -> Iterator[CameraCase]:
     with request.param() as made:
         yield made
@@ -98,10 +105,10 @@ def test_a_setpoint_is_followed(ready: ArmCase) -> None:
 def test_a_setpoint_beyond_the_limits_is_clipped(ready: ArmCase) -> None:
     start = np.clip(ready.arm.read_state().q, Q_MIN, Q_MAX)
     for beyond in (Q_MAX + 1.0, Q_MIN - 1.0):
-        wish = start.copy()
-        wish[4] = beyond[4]  # the wrist's yaw, which can go to both ends and hits nothing
-        applied = drive(ready, lambda q=wish: ArmSetpoint(q=q, dq=np.zeros(N_JOINTS)), 1.5)
-        assert applied[4] == pytest.approx(np.clip(wish[4], Q_MIN[4], Q_MAX[4]), abs=1e-9)
+        desired = start.copy()
+        desired[4] = beyond[4]  # the wrist's yaw, which can go to both ends and hits nothing
+        applied = drive(ready, lambda q=desired: ArmSetpoint(q=q, dq=np.zeros(N_JOINTS)), 1.5)
+        assert applied[4] == pytest.approx(np.clip(desired[4], Q_MIN[4], Q_MAX[4]), abs=1e-9)
         assert ready.arm.read_state().q[4] == pytest.approx(applied[4], abs=0.03)
 
 
@@ -177,12 +184,11 @@ def test_a_frame_matches_the_intrinsics_and_is_plausible(view: CameraCase) -> No
     assert (frame.depth_m > 0).mean() > 0.2
 
 
-def test_nobody_can_change_a_frame(view: CameraCase) -> None:
+def test_a_frame_is_read_only(view: CameraCase) -> None:
     view.camera.connect()
     frame = view.camera.wait_for_frame(1.0)
     for array in (frame.colour, frame.depth_m):
-        with pytest.raises(ValueError, match="read-only"):
-            array[0, 0] = 0
+        assert not array.flags.writeable
 
 
 def test_a_frame_that_does_not_come_in_time_is_an_error(view: CameraCase) -> None:

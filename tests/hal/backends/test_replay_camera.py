@@ -1,4 +1,4 @@
-"""Recorded frames, written, read and played."""
+"""Recorded frames: saved, loaded and replayed."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import pytest
 from hal.backends.replay_camera import ReplayCamera, load_frames, make_demo_frames, save_frames
 from hal.base.clock import ManualClock
 from hal.base.errors import CameraError, HalTimeoutError
+from tests.support.errors import raises
 
 
 def test_frames_survive_the_file(tmp_path: Path) -> None:
@@ -30,15 +31,17 @@ def test_frames_survive_the_file(tmp_path: Path) -> None:
         )
 
 
-def test_a_file_that_is_no_recording_is_refused_by_name(tmp_path: Path) -> None:
+def test_a_file_without_a_recording_is_rejected_with_its_name(tmp_path: Path) -> None:
     np.savez(tmp_path / "other.npz", a=np.zeros(3))
-    with pytest.raises(CameraError, match=r"other\.npz holds no recorded frames"):
+    with raises(CameraError, "not_a_recording") as caught:
         load_frames(tmp_path / "other.npz")
+    assert "other.npz" in str(caught.value)
+    assert "save_frames()" in str(caught.value)
     with pytest.raises(FileNotFoundError):
         load_frames(tmp_path / "missing.npz")
 
 
-def test_a_recording_plays_at_its_own_rate_and_starts_again() -> None:
+def test_a_recording_is_replayed_at_its_own_rate_and_repeated() -> None:
     clock = ManualClock(3.0)
     frames = make_demo_frames(3)
     camera = ReplayCamera(frames, clock=clock)
@@ -49,7 +52,7 @@ def test_a_recording_plays_at_its_own_rate_and_starts_again() -> None:
     assert all((f.colour == frames[i % 3].colour).all() for i, f in enumerate(played))
 
 
-def test_frames_nobody_waited_for_are_missed_as_with_a_real_camera() -> None:
+def test_frames_without_a_wait_are_missed_as_with_a_real_camera() -> None:
     clock = ManualClock()
     camera = ReplayCamera(clock=clock)
     camera.connect()
@@ -64,12 +67,12 @@ def test_a_recording_that_does_not_loop_ends_with_a_timeout() -> None:
     camera.connect()
     camera.wait_for_frame(1.0)
     camera.wait_for_frame(1.0)
-    with pytest.raises(HalTimeoutError, match="the recording has ended"):
+    with raises(HalTimeoutError, "recording_ended"):
         camera.wait_for_frame(0.5)
 
 
-def test_nothing_to_play_is_refused() -> None:
-    with pytest.raises(CameraError, match="no frame to play"):
+def test_an_empty_recording_is_rejected() -> None:
+    with raises(CameraError, "no_frames"):
         ReplayCamera([])
 
 

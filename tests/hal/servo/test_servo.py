@@ -454,11 +454,11 @@ def test_an_arm_that_rejects_commands_is_latched_and_gets_no_more() -> None:
     bench = Bench()
     bench.servo.stream(move())
     bench.run(0.5)
-    bench.arm.refuse_commands = True
+    bench.arm.reject_commands = True
     bench.run(1.0)
     assert bench.mode is STOPPED
     assert "takes no commands" in bench.reason
-    bench.arm.refuse_commands = False
+    bench.arm.reject_commands = False
     stuck = bench.servo.status().q_command
     bench.run(0.1)
     assert bench.servo.status().q_command == pytest.approx(stuck)

@@ -1,14 +1,14 @@
-"""The vendor's state machine, as it was observed."""
+"""The vendor's state machine, as it was measured."""
 
 from __future__ import annotations
 
 import pytest
 
-from hal.z1_protocol.states import MOVES, Fsm, granted
+from hal.z1_protocol.states import MOVES, Fsm, is_granted
 
 
 @pytest.mark.parametrize(
-    ("now", "asked", "expected"),
+    ("present", "requested", "expected"),
     [
         (Fsm.PASSIVE, Fsm.JOINTCTRL, True),
         (Fsm.PASSIVE, Fsm.CARTESIAN, True),
@@ -28,17 +28,17 @@ from hal.z1_protocol.states import MOVES, Fsm, granted
         (Fsm.TEACH, Fsm.JOINTCTRL, True),
     ],
 )
-def test_a_request_is_granted_as_the_controller_grants_it(now: Fsm, asked: Fsm, expected: bool) -> None:
-    assert granted(now, asked) is expected
+def test_a_request_is_granted_as_the_controller_grants_it(present: Fsm, requested: Fsm, expected: bool) -> None:
+    assert is_granted(present, requested) is expected
 
 
 @pytest.mark.parametrize("state", list(Fsm))
 def test_staying_is_always_granted(state: Fsm) -> None:
-    assert granted(state, state)
-    assert granted(state, Fsm.INVALID)
+    assert is_granted(state, state)
+    assert is_granted(state, Fsm.INVALID)
 
 
 @pytest.mark.parametrize("state", sorted(MOVES))
 def test_no_move_starts_from_lowcmd_or_during_another(state: Fsm) -> None:
-    assert not granted(Fsm.LOWCMD, state)
-    assert not granted(Fsm.TRAJECTORY if state is not Fsm.TRAJECTORY else Fsm.MOVEL, state)
+    assert not is_granted(Fsm.LOWCMD, state)
+    assert not is_granted(Fsm.TRAJECTORY if state is not Fsm.TRAJECTORY else Fsm.MOVEL, state)

@@ -1,4 +1,4 @@
-"""Scripts written for pyrealsense2 and for the Z1's vendor module run unmodified on the twin."""
+"""Scripts for pyrealsense2 and for the Z1's vendor module run unmodified on the twin."""
 
 from __future__ import annotations
 
@@ -28,6 +28,7 @@ def run_script(tmp_path: Path, *arguments: str) -> subprocess.CompletedProcess[s
     return subprocess.run(command, capture_output=True, text=True, check=False)
 
 
+@pytest.mark.integration
 @needs_librealsense
 def test_a_script_reads_distances_from_the_twin(tmp_path: Path) -> None:
     done = run_script(tmp_path, "--lockstep", "--distance-m=0.45", str(SCRIPTS / "distance.py"))
@@ -40,6 +41,7 @@ def test_a_script_reads_distances_from_the_twin(tmp_path: Path) -> None:
     assert "#" in lines[16]
 
 
+@pytest.mark.integration
 @needs_librealsense
 def test_a_viewer_with_options_of_its_own_shows_its_window_in_a_file(tmp_path: Path) -> None:
     viewer = str(SCRIPTS / "aligned_viewer.py")
@@ -52,28 +54,30 @@ def test_a_viewer_with_options_of_its_own_shows_its_window_in_a_file(tmp_path: P
         "depth scale 0.000100",
         "there and back True True",
     ]
-    picture = cv2.imread(str(tmp_path / "Aligned.png"))
-    assert picture is not None
-    assert picture.shape == (480, 1280, 3)
-    assert (picture[:60, :600] == 153).mean() > 0.9  # the background is gone
-    assert (picture[200:400, 200:400] != 153).mean() > 0.5
+    image = cv2.imread(str(tmp_path / "Aligned.png"))
+    assert image is not None
+    assert image.shape == (480, 1280, 3)
+    assert (image[:60, :600] == 153).mean() > 0.9  # the background is removed
+    assert (image[200:400, 200:400] != 153).mean() > 0.5
     assert f"its window is in {tmp_path / 'Aligned.png'}" in done.stderr
 
 
+@pytest.mark.integration
 @needs_librealsense
 def test_a_script_filters_records_and_replays(tmp_path: Path) -> None:
     recording, cloud = tmp_path / "second.db3", tmp_path / "cloud.ply"
     script = str(SCRIPTS / "record_and_replay.py")
     done = run_script(tmp_path, "--lockstep", script, str(recording), str(cloud))
     assert done.returncode == 0, done.stderr
-    seen = done.stdout.splitlines()
-    assert seen[:2] == ["filtered (120, 212)", "colorized (240, 424, 3)"]
-    assert seen[2].startswith("vertices 101760 0.")
-    assert seen[3:] == ["played from Intel RealSense D405", "played True"]
+    lines = done.stdout.splitlines()
+    assert lines[:2] == ["filtered (120, 212)", "colorized (240, 424, 3)"]
+    assert lines[2].startswith("vertices 101760 0.")
+    assert lines[3:] == ["played from Intel RealSense D405", "played True"]
     assert recording.stat().st_size > 1e6
     assert cloud.read_bytes().startswith(b"ply")
 
 
+@pytest.mark.integration
 @needs_librealsense
 def test_a_script_for_the_vendors_module_calculates(tmp_path: Path) -> None:
     done = run_script(tmp_path, "--lockstep", str(UNITREE_SCRIPTS / "calculations.py"))
@@ -91,54 +95,57 @@ def test_a_script_for_the_vendors_module_calculates(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.integration
 @needs_librealsense
-def test_a_script_for_the_vendors_module_moves_the_arm_in_every_way(tmp_path: Path) -> None:
+def test_a_script_for_the_vendors_module_moves_the_arm_by_every_method(tmp_path: Path) -> None:
     done = run_script(tmp_path, "--start=startFlat", str(UNITREE_SCRIPTS / "tour.py"))
     assert done.returncode == 0, done.stderr
-    said = dict(re.split(r" (?=\[|True|False|[A-Z]{3}|\d)", line, maxsplit=1) for line in done.stdout.splitlines())
-    numbers = {name: np.fromstring(text.strip("[]"), sep=" ") for name, text in said.items() if text[0] == "["}
+    printed = dict(re.split(r" (?=\[|True|False|[A-Z]{3}|\d)", line, maxsplit=1) for line in done.stdout.splitlines())
+    numbers = {name: np.fromstring(text.strip("[]"), sep=" ") for name, text in printed.items() if text[0] == "["}
     assert numbers["forward"] == pytest.approx(FORWARD, abs=0.03)
     assert numbers["jogged"] == pytest.approx(FORWARD + 0.2 * np.eye(6)[0], abs=0.03)
     assert numbers["jogged to"] == pytest.approx([*numbers["jogged"], -0.2], abs=0.05)
     for name, y_m in (("MoveJ", -0.1), ("MoveL", 0.0), ("MoveC", 0.1)):
-        assert said[name] == "True"
+        assert printed[name] == "True"
         assert numbers[f"{name} to"] == pytest.approx([0, 0, 0, 0.45, y_m, 0.35], abs=0.02)
-    assert said["unreachable"] == "False"
-    assert "no joints within the limits reach the posture" in done.stderr
-    assert (said["CARTESIAN"], said["down"]) == ("True", "True")
+    assert printed["unreachable"] == "False"
+    assert "is unreachable within the joint limits" in done.stderr
+    assert (printed["CARTESIAN"], printed["down"]) == ("True", "True")
     assert numbers["sideways"] == pytest.approx([0, 0], abs=0.005)
     assert numbers["start"] == pytest.approx(START_FLAT, abs=0.03)
-    assert (said["passive"], said["low level"], said["end"]) == ("PASSIVE", "LOWCMD", "JOINTCTRL")
+    assert (printed["passive"], printed["low level"], printed["end"]) == ("PASSIVE", "LOWCMD", "JOINTCTRL")
     assert numbers["low level to"] == pytest.approx([0.2, 0.6, -0.6, -0.1, 0, 0], abs=0.06)
-    assert said["motors"] == "8 0 0"
+    assert printed["motors"] == "8 0 0"
 
 
+@pytest.mark.integration
 @needs_librealsense
-def test_in_lock_step_the_arm_stands_still_and_a_script_is_told_so(tmp_path: Path) -> None:
+def test_in_lock_step_the_arm_is_fixed_and_a_script_gets_an_error(tmp_path: Path) -> None:
     script = tmp_path / "moves.py"
     script.write_text("import unitree_arm_interface as sdk\nsdk.ArmInterface(True).loopOn()\n")
     done = run_script(tmp_path, "--lockstep", str(script))
     assert done.returncode == 1
-    assert "with --lockstep the twin's arm stands still; to move it leave that out." in done.stderr
+    assert "with --lockstep the twin's arm does not move" in done.stderr
 
 
-def test_a_program_ends_here_as_it_would_alone(
+def test_a_program_ends_as_under_python(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(sys, "argv", [])
     monkeypatch.setattr(sys, "path", [*sys.path])
-    (tmp_path / "beside.py").write_text("codes = {'seven': 7, 'word': 'gone', 'none': None}\n")
+    (tmp_path / "neighbour.py").write_text("codes = {'seven': 7, 'text': 'failed', 'none': None}\n")
     script = tmp_path / "ends.py"
     script.write_text(
-        "import sys, beside\nif __name__ == '__main__' and sys.argv[1:]: sys.exit(beside.codes[sys.argv[1]])"
+        "import sys, neighbour\nif __name__ == '__main__' and sys.argv[1:]: sys.exit(neighbour.codes[sys.argv[1]])"
     )
-    assert [run_program(script, words) for words in (["seven"], ["word"], ["none"], [])] == [7, 1, 0, 0]
-    assert capsys.readouterr().err == "gone\n"
+    assert [run_program(script, options) for options in (["seven"], ["text"], ["none"], [])] == [7, 1, 0, 0]
+    assert capsys.readouterr().err == "failed\n"
     with pytest.raises(KeyError):
         run_program(script, ["other"])
 
 
-def test_a_script_that_is_not_there_and_a_step_that_is_unknown_are_bad_usage(tmp_path: Path) -> None:
+@pytest.mark.integration
+def test_a_missing_script_and_an_unknown_step_are_usage_errors(tmp_path: Path) -> None:
     done = run_script(tmp_path, "nowhere.py")
     assert (done.returncode, done.stderr) == (2, "error: there is no script nowhere.py.\n")
     command = [sys.executable, "-P", "-m", "scripts.cli", "twin", "run-scrip"]
@@ -147,7 +154,7 @@ def test_a_script_that_is_not_there_and_a_step_that_is_unknown_are_bad_usage(tmp
     assert "run-script, wire; not 'run-scrip'" in done.stderr
 
 
-def test_windows_keep_their_last_picture_and_press_keys_in_the_end(tmp_path: Path) -> None:
+def test_windows_keep_their_last_image_and_press_keys_at_the_end(tmp_path: Path) -> None:
     clock = ManualClock()
     windows = Windows(clock, frames=2)
     windows.show("Depth / raw", np.full((4, 6), 0.5))
@@ -157,12 +164,12 @@ def test_windows_keep_their_last_picture_and_press_keys_in_the_end(tmp_path: Pat
     assert [windows.wait_key(1) for _ in range(3)] == [27, ord("q"), 27]
     (file,) = windows.save(tmp_path / "new")
     assert file.name == "Depth_raw.png"
-    picture = cv2.imread(str(file))
-    assert picture is not None
-    assert (picture == 255).all()
+    image = cv2.imread(str(file))
+    assert image is not None
+    assert (image == 255).all()
 
 
-def test_opencv_gets_its_own_functions_back(tmp_path: Path) -> None:
+def test_opencvs_own_functions_are_restored(tmp_path: Path) -> None:
     before = cv2.waitKey
     with windows_as_files(tmp_path, ManualClock(), 1) as windows:
         if windows is None:

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hal.base.errors import InvalidValueError
 from hal.z1_protocol.controller import LABELS, decode_state, encode_command
 from hal.z1_protocol.states import Fsm
 from scripts.commands.run_demo import LIFTED_M
@@ -23,8 +24,9 @@ from sim_twin.drop_in.process import make_twin
 from sim_twin.drop_in.rig import free_ports
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("spelling", ["wire", "--wire"])
-def test_a_client_is_answered_until_somebody_ends_it(spelling: str) -> None:
+def test_a_client_is_answered_until_the_signal(spelling: str) -> None:
     command_port, state_port = free_ports()
     ports = [f"--command-port={command_port}", f"--state-port={state_port}"]
     command = [sys.executable, "-P", "-m", "scripts.cli", "twin", spelling, *ports]
@@ -44,17 +46,17 @@ def test_a_client_is_answered_until_somebody_ends_it(spelling: str) -> None:
             assert state.state is Fsm.PASSIVE
             assert state.joints.q[:6] == pytest.approx(LABELS["startFlat"], abs=0.05)
             process.send_signal(signal.SIGINT)
-            said = process.stdout.read()
+            summary = process.stdout.read()
             assert process.wait(20.0) == 0
         finally:
             process.kill()
-    assert said.startswith("1 answers; 1 datagrams were no commands (the last one: a command has 8 bytes")
+    assert summary.startswith("1 answers; 1 invalid datagrams (the last one: a command has 8 bytes")
 
 
 def test_the_folded_arm_rests_on_itself_in_passive() -> None:
     config = Config()
     twin = make_twin(make_scene(config), config.wire, start_pose(config.start))
-    twin.hear(encode_command(Fsm.INVALID))
+    twin.receive(encode_command(Fsm.INVALID))
     for _ in range(1000):
         twin.tick()
         twin.world.step()
@@ -63,13 +65,14 @@ def test_the_folded_arm_rests_on_itself_in_passive() -> None:
     assert np.abs(dq).max() < 0.05
 
 
-def test_home_is_where_the_camera_looks_from() -> None:
+def test_home_is_the_cameras_viewpoint() -> None:
     config = Config(start="home", object="box")
     twin = make_twin(make_scene(config), config.wire, start_pose(config.start))
     assert twin.world.read_arm()[0][1] == pytest.approx(1.085, abs=0.01)
 
 
-def test_as_board_it_is_checked_and_driven_by_a_controller_and_seen_in_rerun() -> None:
+@pytest.mark.integration
+def test_as_motor_board_it_is_checked_and_driven_by_a_controller_and_shown_in_rerun() -> None:
     port, view_port = free_ports()
     options = ["--depth=board", f"--board-port={port}", "--view", f"--view-port={view_port}"]
     command = [sys.executable, "-P", "-m", "scripts.cli", "twin", "wire", *options]
@@ -89,15 +92,16 @@ def test_as_board_it_is_checked_and_driven_by_a_controller_and_seen_in_rerun() -
             controller.send(bytes(140))
             assert len(controller.recv(4096)) == 154
             if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-                assert f"127.0.0.1:{view_port}" in process.stderr.readline()  # where to look at it
+                assert f"127.0.0.1:{view_port}" in process.stderr.readline()  # address of the live view
             process.send_signal(signal.SIGINT)
-            assert process.stdout.read() == "2 answers; 0 datagrams were no commands\n"
+            assert process.stdout.read() == "2 answers; 0 invalid datagrams\n"
             assert process.wait(20.0) == 0
         finally:
             process.kill()
 
 
 @pytest.mark.slow
+@pytest.mark.integration
 def test_the_demo_lifts_the_bottle_through_both_real_drivers(tmp_path: Path) -> None:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
@@ -108,6 +112,6 @@ def test_the_demo_lifts_the_bottle_through_both_real_drivers(tmp_path: Path) -> 
     assert "Z1: connected to 127.0.0.1" in (tmp_path / "hal.log").read_text()
 
 
-def test_a_demo_through_the_wire_cannot_be_in_lockstep() -> None:
-    with pytest.raises(ValueError, match="leave out --wire-sim"):
+def test_a_demo_over_the_vendors_protocol_cannot_be_in_lockstep() -> None:
+    with pytest.raises(InvalidValueError):
         DemoConfig(rig=RigOption(wire_sim=True), lockstep=True)

@@ -1,4 +1,4 @@
-"""The twin in place of the arm board, driven as the vendor's controller does it, with bytes written down here."""
+"""The twin in place of the motor board, driven as by the vendor's controller, with bytes written by hand."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from hal.backends.z1.torque import FeedForward
 from hal.base import z1
 from hal.base.clock import WallClock
+from hal.base.z1_dynamics import FeedForward
 from hal.z1_protocol.records import MotorError, MotorLink
-from sim_twin.controller.motor_board import ArmBoard
+from sim_twin.controller.motor_board import MotorBoard
 from sim_twin.drop_in.config import WireConfig
 from sim_twin.drop_in.rig import free_ports
 from sim_twin.drop_in.udp_server import WireServer
@@ -22,7 +22,7 @@ from sim_twin.model.world import World
 
 START = np.append(z1.Q_HOME, -1.0)
 K_P = (25.0, 30.0, 20.0, 20.0, 15.0, 30.0, 5.0)
-"""What the vendor's controller sends in JOINTCTRL."""
+"""Gains of the vendor's controller in JOINTCTRL (measured)."""
 K_W = (2000.0, 3000.0, 3000.0, 3000.0, 2000.0, 2000.0, 100.0)
 
 
@@ -37,25 +37,25 @@ def positions(state: bytes) -> np.ndarray:
 
 
 @pytest.fixture
-def board() -> ArmBoard:
-    return ArmBoard(World(SceneConfig()))
+def board() -> MotorBoard:
+    return MotorBoard(World(SceneConfig()))
 
 
 class Controller:
-    """The vendor's side: it carries the arm's weight and holds a position, or goes to another with a limited speed."""
+    """The vendor's side: position commands with gravity compensation."""
 
     def __init__(self) -> None:
-        self._weight = FeedForward()
+        self._feed_forward = FeedForward()
 
     def command(self, state: bytes, q: np.ndarray) -> bytes:
-        return command(q, self._weight.torque(positions(state), np.zeros(7)))
+        return command(q, self._feed_forward.torque(positions(state), np.zeros(7)))
 
-    def drive(self, board: ArmBoard, goals: list[np.ndarray]) -> bytes:
+    def drive(self, board: MotorBoard, goals: list[np.ndarray]) -> bytes:
         """Exchange at 250 Hz, one goal after the other; return the last state."""
-        state = board.hear(bytes(140))
+        state = board.receive(bytes(140))
         for q in goals:
             assert state is not None
-            state = board.hear(self.command(state, q))
+            state = board.receive(self.command(state, q))
             for _ in range(2):
                 board.tick()
                 board.world.step()
@@ -63,32 +63,32 @@ class Controller:
         return state
 
 
-def test_the_self_check_is_answered_motor_by_motor(board: ArmBoard) -> None:
-    assert board.hear(b"\x02") == bytes.fromhex("20 08 01 01 01 01 01 01 01 01")
+def test_the_self_check_is_answered_motor_by_motor(board: MotorBoard) -> None:
+    assert board.receive(b"\x02") == bytes.fromhex("20 08 01 01 01 01 01 01 01 01")
     board.motors.link[1, 1] = MotorLink.LOST
-    assert board.hear(b"\x02") == bytes.fromhex("20 08 01 01 00 01 01 01 01 01")
+    assert board.receive(b"\x02") == bytes.fromhex("20 08 01 01 00 01 01 01 01 01")
 
 
 def test_without_a_gripper_there_are_seven_motors_and_six_records() -> None:
-    board = ArmBoard(World(SceneConfig()), gripper=False)
-    assert board.hear(b"\x02") == bytes.fromhex("20 07 01 01 01 01 01 01 01")
-    answer = board.hear(bytes(120))
+    board = MotorBoard(World(SceneConfig()), gripper=False)
+    assert board.receive(b"\x02") == bytes.fromhex("20 07 01 01 01 01 01 01 01")
+    answer = board.receive(bytes(120))
     assert answer is not None
     assert len(answer) == 132
-    assert board.hear(bytes(140)) is None
-    assert "140 bytes; of this board, with 6 joints, they have 120" in board.last_refusal
+    assert board.receive(bytes(140)) is None
+    assert "140 bytes; allowed with 6 joints are 120" in board.invalid_reason
 
 
-def test_zeros_are_answered_with_154_bytes_of_measurements(board: ArmBoard) -> None:
-    state = board.hear(bytes(140))
+def test_zeros_are_answered_with_154_bytes_of_measurements(board: MotorBoard) -> None:
+    state = board.receive(bytes(140))
     assert state is not None
     assert len(state) == 154
     assert positions(state) == pytest.approx(START, abs=0.02)
-    assert state[16:22] == bytes([30, 0, 0, 30, 0, 0])  # 30 °C, no error, heard
+    assert state[16:22] == bytes([30, 0, 0, 30, 0, 0])  # 30 °C, no error, connected
 
 
-def test_the_arm_is_parked_until_the_first_command_and_then_limp(board: ArmBoard) -> None:
-    board.hear(b"\x02")
+def test_the_arm_is_parked_until_the_first_command_and_then_without_torque(board: MotorBoard) -> None:
+    board.receive(b"\x02")
     for _ in range(250):
         board.tick()
         board.world.step()
@@ -100,62 +100,62 @@ def test_the_arm_is_parked_until_the_first_command_and_then_limp(board: ArmBoard
     assert np.abs(board.world.read_arm()[0] - positions(state)).max() > 0.05
 
 
-def test_the_vendors_gains_hold_the_arm_and_move_it(board: ArmBoard) -> None:
+def test_the_vendors_gains_hold_the_arm_and_move_it(board: MotorBoard) -> None:
     controller = Controller()
     state = controller.drive(board, [START] * 250)
     assert positions(state) == pytest.approx(START, abs=0.02)
     goal = START + np.array([0.2, 0.1, -0.1, 0.1, -0.1, 0.2, 0.3])
-    way = [START + share * (goal - START) for share in np.linspace(0.0, 1.0, 125)]
-    state = controller.drive(board, [*way, *[goal] * 125])
+    ramp = [START + ratio * (goal - START) for ratio in np.linspace(0.0, 1.0, 125)]
+    state = controller.drive(board, [*ramp, *[goal] * 125])
     assert positions(state) == pytest.approx(goal, abs=0.02)
 
 
-def test_a_motors_record_tells_what_ails_it(board: ArmBoard) -> None:
+def test_a_motor_record_reports_its_faults(board: MotorBoard) -> None:
     board.motors.error[1, 1] = MotorError.OVERHEAT
     board.motors.link[4, 0] = MotorLink.CRC_ERROR
     board.motors.temperature_c[1, 1] = 71.4
-    state = board.hear(bytes(140))
+    state = board.receive(bytes(140))
     assert state is not None
     assert state[22 + 19 : 22 + 22] == bytes([71, 0x04, 0])
     assert state[4 * 22 + 16 : 4 * 22 + 19] == bytes([30, 0, 2 << 6])
 
 
-def test_a_dead_board_answers_nothing_and_passes_nothing_on(board: ArmBoard) -> None:
+def test_a_silent_board_answers_nothing_and_forwards_nothing(board: MotorBoard) -> None:
     Controller().drive(board, [START] * 100)
     board.motors.silent = True
-    assert board.hear(b"\x02") is None
-    assert board.hear(command(START, np.zeros(7))) is None
+    assert board.receive(b"\x02") is None
+    assert board.receive(command(START, np.zeros(7))) is None
     for _ in range(250):
         board.tick()
         board.world.step()
     assert np.abs(board.world.read_arm()[0] - START).max() > 0.1
     board.motors.silent = False
-    assert board.hear(b"\x02") is not None
+    assert board.receive(b"\x02") is not None
 
 
 @pytest.mark.parametrize("at", [0, 4, 8, 12, 16])
-def test_a_number_that_is_none_is_refused_and_moves_nothing(board: ArmBoard, at: int) -> None:
-    board.hear(command(START, np.zeros(7)))
+def test_a_value_that_is_not_finite_is_rejected_and_moves_nothing(board: MotorBoard, at: int) -> None:
+    board.receive(command(START, np.zeros(7)))
     bad = bytearray(command(START, np.zeros(7)))
     bad[at : at + 4] = struct.pack("<f", float("nan"))
-    assert board.hear(bytes(bad)) is None
-    assert board.refused == 1
-    assert "must be finite" in board.last_refusal
+    assert board.receive(bytes(bad)) is None
+    assert board.invalid_datagrams == 1
+    assert "must be finite" in board.invalid_reason
 
 
-def test_random_bytes_are_counted_and_never_crash(board: ArmBoard) -> None:
+def test_random_bytes_are_counted_and_never_crash(board: MotorBoard) -> None:
     rng = np.random.default_rng(3)
     good = command(START, np.zeros(7))
     for i in range(5000):
         data = bytearray(good)
         data[rng.integers(len(data))] ^= 1 << int(rng.integers(8))
         kinds = (bytes(data), bytes(data[: rng.integers(140)]), rng.bytes(140), rng.bytes(int(rng.integers(0, 400))))
-        answer = board.hear(kinds[i % 4])
+        answer = board.receive(kinds[i % 4])
         assert answer is None or len(answer) in (10, 154)
         if i % 10 == 0:
             board.tick()
             board.world.step()
-    assert board.refused > 1500
+    assert board.invalid_datagrams > 1500
     assert np.isfinite(board.world.read_arm()[0]).all()
     assert not board.world.data.warning.number.any()
 
@@ -166,38 +166,39 @@ def test_random_bytes_are_counted_and_never_crash(board: ArmBoard) -> None:
 @pytest.fixture
 def ports() -> Iterator[list[int]]:
     configs = [WireConfig(depth="board", board_port=port) for port in free_ports()]
-    servers = [WireServer(ArmBoard(World(SceneConfig())), config) for config in configs]
+    servers = [WireServer(MotorBoard(World(SceneConfig())), config) for config in configs]
     with servers[0], servers[1]:
         yield [config.board_port for config in configs]
 
 
 def link(port: int) -> socket.socket:
-    made = socket.socket(type=socket.SOCK_DGRAM)
-    made.bind(("127.0.0.1", 0))
-    made.connect(("127.0.0.1", port))
-    made.settimeout(5.0)
-    return made
+    client = socket.socket(type=socket.SOCK_DGRAM)
+    client.bind(("127.0.0.1", 0))
+    client.connect(("127.0.0.1", port))
+    client.settimeout(5.0)
+    return client
 
 
-def exchange(wire: socket.socket, data: bytes) -> bytes:
-    wire.send(data)
-    return wire.recv(4096)
+def exchange(client: socket.socket, data: bytes) -> bytes:
+    client.send(data)
+    return client.recv(4096)
 
 
-def test_a_controller_brings_up_two_arms_and_moves_one(ports: list[int]) -> None:
+@pytest.mark.integration
+def test_a_controller_starts_two_arms_and_moves_one(ports: list[int]) -> None:
     clock, controller = WallClock(), Controller()
     with link(ports[0]) as one, link(ports[1]) as other:
-        for wire in (one, other):
-            assert exchange(wire, b"\x02") == bytes.fromhex("20 08 01 01 01 01 01 01 01 01")
-            assert len(exchange(wire, bytes(140))) == 154
-        states = [exchange(wire, command(START, np.zeros(7))) for wire in (one, other)]
+        for client in (one, other):
+            assert exchange(client, b"\x02") == bytes.fromhex("20 08 01 01 01 01 01 01 01 01")
+            assert len(exchange(client, bytes(140))) == 154
+        states = [exchange(client, command(START, np.zeros(7))) for client in (one, other)]
         goals = [START + 0.2 * np.eye(7)[0], START]
         for i in range(500):
             due_s = clock.now_s() + 0.004
-            share = min(i / 250, 1.0)
-            for k, wire in enumerate((one, other)):
-                q = START + share * (goals[k] - START)
-                states[k] = exchange(wire, controller.command(states[k], q))
+            ratio = min(i / 250, 1.0)
+            for k, client in enumerate((one, other)):
+                q = START + ratio * (goals[k] - START)
+                states[k] = exchange(client, controller.command(states[k], q))
             clock.sleep_until(due_s)
         one.send(b"nonsense")
         one.send(bytes(139))

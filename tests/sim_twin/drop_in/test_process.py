@@ -1,4 +1,4 @@
-"""The rig `wire-sim`: world and controller in one process, optics in another, both real drivers in this one."""
+"""Rig `wire-sim`: world and controller in one process, optics in another, both real drivers in this one."""
 
 from __future__ import annotations
 
@@ -26,12 +26,14 @@ from sim_twin.drop_in.camera_process import RemoteSource
 from sim_twin.drop_in.config import WireConfig
 from sim_twin.drop_in.process import WireProcess
 from sim_twin.drop_in.realsense_source import TwinSource
-from sim_twin.drop_in.rig import WiredArm, WiredCamera, free_ports
+from sim_twin.drop_in.rig import WireSimArm, WireSimCamera, free_ports
 from sim_twin.drop_in.shared_memory import SharedWorld, make_memory
 from sim_twin.ground_truth import read_ground_truth
 from sim_twin.model.scene import SceneConfig
 from sim_twin.model.world import World
+from tests.support.errors import raises
 
+pytestmark = pytest.mark.integration
 needs_librealsense = pytest.mark.skipif(find_spec("pyrealsense2") is None, reason="pyrealsense2 has no wheel here")
 REST = np.zeros(z1.N_JOINTS)
 
@@ -44,9 +46,9 @@ def make_process(scene: SceneConfig | None = None) -> WireProcess:
 
 @pytest.fixture(scope="module")
 def twin() -> Iterator[WireProcess]:
-    made = make_process()
-    yield made
-    made.close()
+    twin = make_process()
+    yield twin
+    twin.close()
 
 
 def await_true(condition: Callable[[], bool], timeout_s: float = 30.0) -> None:
@@ -60,19 +62,19 @@ def await_true(condition: Callable[[], bool], timeout_s: float = 30.0) -> None:
 # --- Shared memory --------------------------------------------------------------------------------------------------
 
 
-def test_what_is_published_is_read_and_what_is_half_written_is_not() -> None:
+def test_published_poses_are_read_and_torn_ones_rejected() -> None:
     fd = make_memory(SharedWorld.SIZE)
-    here, there = SharedWorld(fd), SharedWorld(fd)
-    here.publish(1.5, np.arange(14.0))
-    time_s, qpos = there.read()
+    writer, reader = SharedWorld(fd), SharedWorld(fd)
+    writer.publish(1.5, np.arange(14.0))
+    time_s, qpos = reader.read()
     assert time_s == 1.5
     assert qpos == pytest.approx(np.arange(14.0))
-    here._version += 1  # as if it had died while it wrote
-    with pytest.raises(RuntimeError, match="ended while it wrote"):
-        there.read()
-    here.publish(2.5, np.ones(7))  # by whoever takes its place
-    assert there.read()[0] == 2.5
-    assert there.read()[1] == pytest.approx(np.ones(7))
+    writer._version += 1  # as if it had ended during a write
+    with raises(HalError, "torn_write"):
+        reader.read()
+    writer.publish(2.5, np.ones(7))  # by its successor
+    assert reader.read()[0] == 2.5
+    assert reader.read()[1] == pytest.approx(np.ones(7))
     os.close(fd)
 
 
@@ -81,24 +83,24 @@ def test_what_is_published_is_read_and_what_is_half_written_is_not() -> None:
 
 @pytest.mark.parametrize("mode", [Z1Mode.TRACKING, Z1Mode.LOW_LEVEL])
 def test_the_real_driver_moves_the_twin(twin: WireProcess, mode: Z1Mode) -> None:
-    arm = WiredArm(twin, WallClock(), mode)
+    arm = WireSimArm(twin, WallClock(), mode)
     arm.connect()
     goal = np.clip(arm.read_state().q, z1.Q_MIN, z1.Q_MAX)
     goal[0] += 0.3
 
-    def there() -> bool:
+    def reach_goal() -> bool:
         arm.send(ArmSetpoint(q=goal, dq=REST))
         return abs(arm.read_state().q[0] - goal[0]) < 0.02
 
-    await_true(there)
+    await_true(reach_goal)
     assert arm.read_state().faults == ()
     assert twin.poses()[1][0] == pytest.approx(goal[0], abs=0.03)
     arm.disconnect()
-    assert twin.alive  # as a controller is, when its client has gone
+    assert twin.running  # as a real controller does without a client
 
 
 def test_the_real_driver_reads_the_twins_faults(twin: WireProcess) -> None:
-    arm = WiredArm(twin, WallClock())
+    arm = WireSimArm(twin, WallClock())
     arm.connect()
     twin.error[1, 1] = MotorError.OVERHEAT
     await_true(lambda: "joint2 motor 2: overheat" in arm.read_state().faults)
@@ -106,18 +108,18 @@ def test_the_real_driver_reads_the_twins_faults(twin: WireProcess) -> None:
     arm.disconnect()
 
 
-def test_the_truth_is_told_from_here(twin: WireProcess) -> None:
+def test_the_ground_truth_is_read_from_this_process(twin: WireProcess) -> None:
     truth = read_ground_truth(twin)
     assert truth.object == "bottle"
     assert truth.lifted_m == pytest.approx(0.0, abs=1e-3)
     assert truth.T_base_object[0, 3] == pytest.approx(0.48, abs=0.01)
     assert twin.model.nq == len(truth.qpos) == 14
-    assert twin.account()["answers"] > 0
+    assert twin.statistics()["answers"] > 0
 
 
-def test_a_port_that_is_taken_is_said_here(twin: WireProcess) -> None:
+def test_a_port_in_use_is_reported(twin: WireProcess) -> None:
     twin.start()
-    with pytest.raises(LeaseError, match=rf":{twin.wire.command_port} is taken"):
+    with raises(LeaseError, "port_in_use"):
         WireProcess(twin.config, twin.wire).start()
 
 
@@ -125,30 +127,30 @@ def test_a_port_that_is_taken_is_said_here(twin: WireProcess) -> None:
 
 
 @needs_librealsense
-def test_the_real_camera_driver_sees_the_world_of_the_other_process(twin: WireProcess) -> None:
-    camera = WiredCamera(twin, D405CameraConfig(warm_up_s=0.0))
+def test_the_real_camera_driver_renders_the_world_of_the_other_process(twin: WireProcess) -> None:
+    camera = WireSimCamera(twin, D405CameraConfig(warm_up_s=0.0))
     camera.connect()
     frame = camera.wait_for_frame(10.0)
     camera.disconnect()
-    seen = frame.depth_m[200:400, 250:400]
+    centre = frame.depth_m[200:400, 250:400]
     assert frame.serial == "twin"
-    assert 0.15 < np.median(seen[seen > 0]) < 0.5
+    assert 0.15 < np.median(centre[centre > 0]) < 0.5
     assert frame.colour.std() > 10
 
 
-def test_pictures_cross_as_they_were_drawn() -> None:
+def test_images_are_transferred_unchanged() -> None:
     world, memory, model = World(SceneConfig()), make_memory(SharedWorld.SIZE), make_memory(0)
     SharedWorld(memory).publish(*world.poses())
     os.write(model, pickle.dumps(world.model))
-    standing = cast(WireProcess, SimpleNamespace(config=world.config, memory=memory, model_file=model))
-    look = CaptureRequest(number=7, width=424, height=240, depth=True, colour=True, left=True, right=True)
-    remote = RemoteSource(standing)
-    there = remote.expose(look)
+    still = cast(WireProcess, SimpleNamespace(config=world.config, memory=memory, model_file=model))
+    request = CaptureRequest(number=7, width=424, height=240, depth=True, colour=True, left=True, right=True)
+    remote = RemoteSource(still)
+    transferred = remote.expose(request)
     with TwinSource(world, WallClock()) as source:
-        here = source.expose(look)
+        local = source.expose(request)
     for name in ("depth", "colour", "left", "right"):
-        np.testing.assert_array_equal(getattr(there, name), getattr(here, name))
-    assert there.number == 7
+        np.testing.assert_array_equal(getattr(transferred, name), getattr(local, name))
+    assert transferred.number == 7
     only = remote.expose(CaptureRequest(number=8, width=640, height=480, depth=True))
     assert only.depth is not None
     assert only.depth.shape == (480, 640)
@@ -156,33 +158,34 @@ def test_pictures_cross_as_they_were_drawn() -> None:
     remote.close()
 
 
-def test_the_rig_is_known_by_its_name_and_starts_nothing_yet() -> None:
+def test_the_rig_is_registered_and_starts_nothing_yet() -> None:
     rig = RIGS.make("wire-sim", scene=SceneConfig(object="box"))
-    assert isinstance(rig.arm, WiredArm)
-    assert isinstance(rig.camera, WiredCamera)
+    assert isinstance(rig.arm, WireSimArm)
+    assert isinstance(rig.camera, WireSimCamera)
     assert rig.world.config.object == "box"
-    assert not rig.world.alive
+    assert not rig.world.running
     assert rig.call_every_tick is None
     rig.arm.disconnect()
 
 
-def test_worlds_here_and_there_begin_alike(twin: WireProcess) -> None:
-    here = World(SceneConfig(noise=False))
-    assert twin.start_height_m == here.start_height_m
+def test_worlds_of_both_processes_start_alike(twin: WireProcess) -> None:
+    world = World(SceneConfig(noise=False))
+    assert twin.start_height_m == world.start_height_m
 
 
-def test_a_controller_that_was_killed_is_what_the_driver_says(twin: WireProcess) -> None:
-    arm = WiredArm(twin, WallClock())
+def test_the_driver_reports_a_killed_controller(twin: WireProcess) -> None:
+    arm = WireSimArm(twin, WallClock())
     arm.connect()
     assert twin._child is not None
     os.kill(twin._child.pid, signal.SIGKILL)
-    await_true(lambda: not twin.alive)
+    await_true(lambda: not twin.running)
     clock = WallClock()
-    with pytest.raises(HalError, match="process of the twin's controller was killed by signal 9"):
+    with raises(HalError, "process_ended") as caught:
         while True:
             arm.read_state()
             clock.sleep_until(clock.now_s() + 0.01)
+    assert "the twin's controller was killed by signal 9" in str(caught.value)
     arm.disconnect()
-    with pytest.raises(HalError, match="killed by signal 9"):
-        twin.account()
+    with raises(HalError, "process_ended"):
+        twin.statistics()
     twin.close()

@@ -40,42 +40,42 @@ def source(world: World) -> Iterator[TwinSource]:
 
 
 def expose(
-    source: TwinSource, width: int = 640, height: int = 480, number: int = 1, **wanted: bool | float
+    source: TwinSource, width: int = 640, height: int = 480, number: int = 1, **images: bool | float
 ) -> Exposure:
-    return source.expose(CaptureRequest(number=number, width=width, height=height, **wanted))  # type: ignore[arg-type]
+    return source.expose(CaptureRequest(number=number, width=width, height=height, **images))  # type: ignore[arg-type]
 
 
-def exact(world: World, pinhole: Intrinsics) -> View:
+def render_exact(world: World, pinhole: Intrinsics) -> View:
     renderer = make_renderer(world.model, pinhole, board=world.config.board)
     view = renderer.render(world.snapshot())
     renderer.close()
     return view
 
 
-def grey(picture: np.ndarray | None) -> np.ndarray:
-    assert picture is not None
-    return cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
+def to_grey(image: np.ndarray | None) -> np.ndarray:
+    assert image is not None
+    return cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
 
 
-def shifts(of: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return where corners (N, 2) of one grey picture are, and by how much (N, 2) the other shows them shifted [px]."""
-    corners = cv2.goodFeaturesToTrack(of, 300, 0.02, 8)
-    there, found, _ = cv2.calcOpticalFlowPyrLK(of, seen, corners, None, winSize=(15, 15))
-    back, again, _ = cv2.calcOpticalFlowPyrLK(seen, of, there, None, winSize=(15, 15))
-    sure = (found & again).ravel().astype(bool) & (np.linalg.norm((back - corners).reshape(-1, 2), axis=1) < 0.3)
-    return corners.reshape(-1, 2)[sure], (there - corners).reshape(-1, 2)[sure]
+def measure_shifts(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return corners (N, 2) of one grey image, and their shifts (N, 2) in the other [px]."""
+    corners = cv2.goodFeaturesToTrack(first, 300, 0.02, 8)
+    tracked, found, _ = cv2.calcOpticalFlowPyrLK(first, second, corners, None, winSize=(15, 15))
+    back, again, _ = cv2.calcOpticalFlowPyrLK(second, first, tracked, None, winSize=(15, 15))
+    valid = (found & again).ravel().astype(bool) & (np.linalg.norm((back - corners).reshape(-1, 2), axis=1) < 0.3)
+    return corners.reshape(-1, 2)[valid], (tracked - corners).reshape(-1, 2)[valid]
 
 
-def test_depth_is_exactly_what_its_pinhole_sees(patchwork: World) -> None:
+def test_depth_equals_the_exact_rendering_of_its_pinhole(patchwork: World) -> None:
     with TwinSource(patchwork) as source:
         depth = expose(source, depth=True).depth
     assert depth is not None
-    truth = exact(patchwork, source.calibration.depth(640, 480)).z_m
+    exact_m = render_exact(patchwork, source.calibration.depth(640, 480)).z_m
     measured = depth > 0
     assert measured.mean() > 0.8
-    wrong_m = np.abs(DEPTH_UNIT_M * depth - truth)[measured]
-    assert np.median(wrong_m) < DEPTH_UNIT_M
-    assert np.percentile(wrong_m, 99.5) < 2 * DEPTH_UNIT_M
+    error_m = np.abs(DEPTH_UNIT_M * depth - exact_m)[measured]
+    assert np.median(error_m) < DEPTH_UNIT_M
+    assert np.percentile(error_m, 99.5) < 2 * DEPTH_UNIT_M
 
 
 @needs_egl
@@ -86,28 +86,28 @@ def test_the_driver_undistorts_colour_onto_depth_to_a_fraction_of_a_pixel(patchw
     frame = camera.wait_for_frame(1.0)
     camera.disconnect()
     assert frame.serial == "twin"
-    corners, wrong = shifts(grey(exact(patchwork, frame.intrinsics).colour), grey(frame.colour))
+    corners, error = measure_shifts(to_grey(render_exact(patchwork, frame.intrinsics).colour), to_grey(frame.colour))
     assert len(corners) > 150
-    assert np.ptp(corners, axis=0) @ [1 / 640, 1 / 480] > 1.7  # all over the picture
-    assert np.median(np.linalg.norm(wrong, axis=1)) < 0.1
-    assert np.percentile(np.linalg.norm(wrong, axis=1), 95) < 0.25
+    assert np.ptp(corners, axis=0) @ [1 / 640, 1 / 480] > 1.7  # all over the image
+    assert np.median(np.linalg.norm(error, axis=1)) < 0.1
+    assert np.percentile(np.linalg.norm(error, axis=1), 95) < 0.25
 
 
 @needs_egl
-def test_colour_is_as_far_off_as_the_raw_imager_is(patchwork: World) -> None:
+def test_colour_has_the_distortion_of_the_raw_imager(patchwork: World) -> None:
     with TwinSource(patchwork) as source:
         exposure = expose(source, colour=True, left=True)
-    _, wrong = shifts(grey(exposure.left), grey(exposure.colour))
-    assert np.median(np.linalg.norm(wrong, axis=1)) > 5.0
+    _, error = measure_shifts(to_grey(exposure.left), to_grey(exposure.colour))
+    assert np.median(np.linalg.norm(error, axis=1)) > 5.0
 
 
 @needs_egl
-def test_the_right_imager_sees_things_shifted_by_their_disparity(patchwork: World) -> None:
+def test_the_right_image_is_shifted_by_the_disparity(patchwork: World) -> None:
     with TwinSource(patchwork) as source:
         exposure = expose(source, depth=True, left=True, right=True)
         focal_px = source.calibration.depth(640, 480).fx
     assert exposure.depth is not None
-    corners, shift = shifts(grey(exposure.left), grey(exposure.right))
+    corners, shift = measure_shifts(to_grey(exposure.left), to_grey(exposure.right))
     columns, rows = np.rint(corners).astype(int).T
     z_m = DEPTH_UNIT_M * exposure.depth[rows, columns]
     known = z_m > 0
@@ -117,7 +117,7 @@ def test_the_right_imager_sees_things_shifted_by_their_disparity(patchwork: Worl
 
 
 @pytest.mark.parametrize("size", list(MIN_Z_M))
-def test_every_stream_lies_in_the_wide_picture(size: tuple[int, int], source: TwinSource) -> None:
+def test_every_stream_is_within_the_wide_image(size: tuple[int, int], source: TwinSource) -> None:
     optics = Optics(source.calibration, *size)
     wide = np.zeros((optics.wide.height, optics.wide.width, 3), np.uint8)
     wide[optics.window] = 255
@@ -126,30 +126,30 @@ def test_every_stream_lies_in_the_wide_picture(size: tuple[int, int], source: Tw
     assert optics.wide.width < 1.1 * size[0]
 
 
-def test_nearer_than_min_z_of_the_resolution_nothing_is_measured(source: TwinSource) -> None:
-    seen = exact(source.world, source.calibration.depth(1280, 720)).z_m
-    assert 0.0 < seen[seen > 0].min() < MIN_Z_M[1280, 720]
+def test_no_depth_below_the_min_z_of_the_resolution(source: TwinSource) -> None:
+    exact_m = render_exact(source.world, source.calibration.depth(1280, 720)).z_m
+    assert 0.0 < exact_m[exact_m > 0].min() < MIN_Z_M[1280, 720]
     depth = expose(source, 1280, 720, depth=True).depth
     assert depth is not None
     assert DEPTH_UNIT_M * depth[depth > 0].min() >= MIN_Z_M[1280, 720] - 1e-9
 
 
-def test_the_left_edge_which_only_one_imager_sees_is_empty(source: TwinSource) -> None:
+def test_the_left_edge_without_stereo_overlap_is_empty(source: TwinSource) -> None:
     depth = expose(source, depth=True).depth
     assert depth is not None
     assert not depth[:, :3].any()
     assert (depth[100:400, 100:500] > 0).mean() > 0.6
 
 
-def test_frames_have_noise_of_their_own_and_the_same_every_time(source: TwinSource) -> None:
-    wanted = {"depth": True, "colour": True, "left": True}
-    first, again, other = (expose(source, number=number, **wanted) for number in (1, 1, 2))
-    for name in wanted:
+def test_noise_differs_between_frames_and_is_reproducible(source: TwinSource) -> None:
+    images = {"depth": True, "colour": True, "left": True}
+    first, again, other = (expose(source, number=number, **images) for number in (1, 1, 2))
+    for name in images:
         assert getattr(first, name).tobytes() == getattr(again, name).tobytes()
         assert getattr(first, name).tobytes() != getattr(other, name).tobytes()
 
 
-def test_half_the_exposure_is_half_the_light(patchwork: World) -> None:
+def test_half_the_exposure_is_half_the_brightness(patchwork: World) -> None:
     with TwinSource(patchwork) as source:
         bright, dark = (expose(source, colour=True, brightness=b).colour for b in (1.0, 0.5))
     assert bright is not None
@@ -157,7 +157,7 @@ def test_half_the_exposure_is_half_the_light(patchwork: World) -> None:
     np.testing.assert_allclose(dark, bright / 2, atol=1)
 
 
-def test_what_is_not_asked_for_is_not_made(source: TwinSource) -> None:
+def test_only_requested_images_are_made(source: TwinSource) -> None:
     exposure = expose(source, depth=True)
     assert exposure.depth is not None
     assert exposure.colour is exposure.left is exposure.right is None
@@ -182,15 +182,16 @@ def test_the_same_world_gives_librealsense_the_same_frames() -> None:
     assert runs[0] == runs[1]
 
 
+@pytest.mark.integration
 @needs_librealsense
-def test_by_the_wall_clock_the_driver_gets_its_frames_too(world: World) -> None:
+def test_the_driver_gets_frames_by_the_wall_clock(world: World) -> None:
     with TwinSource(world, WallClock()) as source:
         source.warm_up(424, 240)
-        # However busy the machine is, the camera is given the time.
-        patient = D405CameraConfig(
+        # Long timeouts, for a busy machine
+        config = D405CameraConfig(
             width=424, height=240, warm_up_s=0.0, connect_timeout_s=60.0, silence_s=60.0, max_age_s=60.0
         )
-        camera = D405Camera(patient, source=source)
+        camera = D405Camera(config, source=source)
         camera.connect()
         first, second = camera.wait_for_frame(60.0), camera.wait_for_frame(60.0)
         camera.disconnect()

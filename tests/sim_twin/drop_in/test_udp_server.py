@@ -1,4 +1,4 @@
-"""The twin behind real ports, by the wall clock, and the real arm's driver against it."""
+"""The twin behind real ports, by the wall clock, and the real arm's driver connected to it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from hal.backends.z1.arm import Z1Arm
 from hal.backends.z1.config import Z1ArmConfig
 from hal.base import z1
 from hal.base.clock import WallClock
-from hal.base.errors import HalError, LeaseError
+from hal.base.errors import HalError, InvalidValueError, LeaseError
 from hal.z1_protocol.controller import LABELS, decode_state, encode_command
 from hal.z1_protocol.records import JointCommands
 from hal.z1_protocol.states import Fsm
@@ -22,6 +22,9 @@ from sim_twin.drop_in.rig import free_ports
 from sim_twin.drop_in.udp_server import WireServer
 from sim_twin.model.scene import SceneConfig
 from sim_twin.model.world import World
+from tests.support.errors import raises
+
+pytestmark = pytest.mark.integration
 
 
 def make_server() -> WireServer:
@@ -32,12 +35,12 @@ def make_server() -> WireServer:
 
 @pytest.fixture
 def server() -> Iterator[WireServer]:
-    with make_server() as made:
-        yield made
+    with make_server() as server:
+        yield server
 
 
 class Client:
-    """A socket at the port that is answered to."""
+    """A socket at the port of the answers."""
 
     def __init__(self, config: WireConfig) -> None:
         self._to = (config.host, config.command_port)
@@ -64,7 +67,7 @@ def await_true(condition: Callable[[], bool], timeout_s: float = 30.0) -> None:
         clock.sleep_until(clock.now_s() + 0.005)
 
 
-def test_a_command_is_answered_and_obeyed(server: WireServer) -> None:
+def test_a_command_is_executed_and_answered(server: WireServer) -> None:
     with Client(server.config) as client:
         assert decode_state(client.exchange(encode_command(Fsm.INVALID))).state is Fsm.PASSIVE
         answer = decode_state(client.exchange(encode_command(Fsm.JOINTCTRL)))
@@ -78,11 +81,11 @@ def test_garbage_is_dropped_and_the_next_command_answered(server: WireServer) ->
         for size in (0, 1, 146, 148, 1400, 9000):
             client.socket.sendto(rng.bytes(size), (server.config.host, server.config.command_port))
         assert decode_state(client.exchange(encode_command(Fsm.INVALID))).state is Fsm.PASSIVE
-    assert server.twin.refused == 6
-    assert server.alive
+    assert server.twin.invalid_datagrams == 6
+    assert server.running
 
 
-def test_a_client_that_is_gone_is_not_missed(server: WireServer) -> None:
+def test_a_motion_continues_without_its_client(server: WireServer) -> None:
     with Client(server.config) as client:
         q = decode_state(client.exchange(encode_command(Fsm.JOINTCTRL))).joints.q
         q[0] += 0.5
@@ -93,7 +96,7 @@ def test_a_client_that_is_gone_is_not_missed(server: WireServer) -> None:
         assert decode_state(client.exchange(encode_command(Fsm.INVALID))).joints.q[0] == pytest.approx(q[0], abs=0.05)
 
 
-def test_a_second_client_is_obeyed_and_the_first_hears_of_it(server: WireServer) -> None:
+def test_a_second_client_is_executed_and_the_first_gets_the_answer(server: WireServer) -> None:
     with Client(server.config) as first, socket.socket(type=socket.SOCK_DGRAM) as second:
         assert decode_state(first.exchange(encode_command(Fsm.INVALID))).state is Fsm.PASSIVE
         second.sendto(encode_command(Fsm.JOINTCTRL), (server.config.host, server.config.command_port))
@@ -103,29 +106,31 @@ def test_a_second_client_is_obeyed_and_the_first_hears_of_it(server: WireServer)
             second.recv(4096)
 
 
-def test_a_port_that_is_taken_is_named(server: WireServer) -> None:
-    with pytest.raises(LeaseError, match=rf"port 127\.0\.0\.1:{server.config.command_port} is taken"):
+def test_a_port_in_use_is_named(server: WireServer) -> None:
+    with raises(LeaseError, "port_in_use") as caught:
         WireServer(server.twin, server.config).start()
+    assert f"port 127.0.0.1:{server.config.command_port} is in use" in str(caught.value)
 
 
-def test_an_address_of_another_machine_is_refused(server: WireServer) -> None:
-    with pytest.raises(HalError, match="Choose an address of this machine"):
+def test_an_address_of_another_machine_is_rejected(server: WireServer) -> None:
+    with raises(HalError, "address_unavailable"):
         WireServer(server.twin, WireConfig(host="192.0.2.1")).start()
-    with pytest.raises(ValueError, match="allowed are 1 to 65535"):
+    with raises(InvalidValueError, "port") as caught:
         WireConfig(state_port=0)
+    assert "state_port is 0; allowed are 1 to 65535" in str(caught.value)
 
 
 def test_it_can_be_started_again_and_twice(server: WireServer) -> None:
     server.start()
     server.stop()
     server.stop()
-    assert not server.alive
+    assert not server.running
     server.start()
     with Client(server.config) as client:
         assert len(client.exchange(encode_command(Fsm.INVALID))) == 208
 
 
-def test_the_world_moves_while_nobody_speaks() -> None:
+def test_the_world_advances_without_a_client() -> None:
     steps: list[int] = []
     with make_server() as server:
         server.stop()
@@ -135,11 +140,11 @@ def test_the_world_moves_while_nobody_speaks() -> None:
     assert server.twin.world.time_s >= 0.002 * 20
 
 
-def test_what_ends_its_thread_is_told_by_stop() -> None:
+def test_stop_raises_the_failure_of_the_thread() -> None:
     server = make_server()
     server.twin.world.step = lambda: 1 / 0  # pyright: ignore[reportAttributeAccessIssue] - a world that fails
     server.start()
-    await_true(lambda: not server.alive)
+    await_true(lambda: not server.running)
     with pytest.raises(ZeroDivisionError):
         server.stop()
 
@@ -147,7 +152,7 @@ def test_what_ends_its_thread_is_told_by_stop() -> None:
 # --- The real driver ------------------------------------------------------------------------------------------------
 
 
-def test_two_arms_live_on_two_pairs_of_ports() -> None:
+def test_two_arms_use_two_pairs_of_ports() -> None:
     with make_server() as one, make_server() as other:
         arms = [
             Z1Arm(WallClock(), Z1ArmConfig(command_port=c.command_port, state_port=c.state_port))

@@ -1,4 +1,4 @@
-"""What the conformance suite runs over: every registered backend, and what wraps one.
+"""Cases of the conformance suite: every registered backend, and every wrapper of one.
 
 To add one, append to `ARM_CASES` or `CAMERA_CASES`: a name and a context manager that yields an `ArmCase` or
 `CameraCase` with a device that is not connected yet.
@@ -43,7 +43,7 @@ class ArmCase:
     arm: Arm
     """Not connected."""
     clock: Clock
-    """Sleep on it to let time pass."""
+    """Clock whose sleep advances the case."""
     prepare: Callable[[], None] = lambda: None
     """Called after connect(), before the first command; a servoed arm claims its lease here."""
     revive: Callable[[], None] = lambda: None
@@ -57,11 +57,11 @@ class CameraCase:
     camera: Camera
     """Not connected."""
     clock: Clock
-    """By which it lives."""
+    """Source of the camera's time."""
 
 
 def make_backend(registry: Any, name: str) -> tuple[Any, Clock]:
-    """Return a backend on a clock that does not make the test wait, and that clock."""
+    """Return a backend on a clock that needs no real time where possible, and that clock."""
     if name in ("mock", "replay"):
         clock = ManualClock(10.0)
         return registry.make(name, clock=clock), clock
@@ -84,7 +84,7 @@ def registered_arm(name: str) -> Iterator[ArmCase]:
 
 
 class TickingClock:
-    """Lets time pass in control periods and ticks the servo in each, as the twin's clock does."""
+    """Clock that advances in control periods and ticks the servo in each, as the twin's does."""
 
     def __init__(self, inner: Clock, period_s: float = 0.002) -> None:
         self._inner = inner
@@ -122,7 +122,7 @@ def servoed_arm(name: str) -> Iterator[ArmCase]:
 
 
 def z1_over_the_twin() -> tuple[Arm, Clock]:
-    """The real arm's driver, with the twin's controller at the other end of the wire, in lock-step."""
+    """Return the real arm's driver connected to the twin's controller, in lock-step, and the clock."""
     world = World(SceneConfig())
     twin, clock = ControlledWorld(world), TwinClock(world)
     clock.call_every_tick(twin.tick)
@@ -175,7 +175,7 @@ def remote_camera() -> Iterator[CameraCase]:
 
 @contextmanager
 def d405_over_the_twin() -> Iterator[CameraCase]:
-    """The real camera's driver, with librealsense and the twin's optics below it."""
+    """Yield the real camera's driver over librealsense and the twin's optics."""
     source = TwinSource(World(SceneConfig()))
     camera = CAMERAS.make("d405", config=D405CameraConfig(warm_up_s=0.1), source=source)
     yield CameraCase(camera, source.clock)

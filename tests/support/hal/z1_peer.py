@@ -1,6 +1,6 @@
-"""A stand-in for the vendor's controller and its arm: speaks the wire, keeps its rules, and breaks on request.
+"""Fake of the vendor's controller and its arm: its wire protocol and state transitions, with fault injection.
 
-It has no more physics than a test needs: damped joints under gravity. The twin has the rest.
+Its physics are damped joints under gravity. The twin has the rest.
 """
 
 from __future__ import annotations
@@ -15,10 +15,11 @@ from typing import Protocol
 
 import numpy as np
 
-from hal.backends.z1.torque import FeedForward, motor_torques
+from hal.backends.z1.torque_limits import motor_torques
 from hal.base import z1
 from hal.base.clock import Clock
-from hal.compat.unitree_arm_interface.model import Z1Model, homoToPosture, postureToHomo
+from hal.base.z1_dynamics import FeedForward
+from hal.base.z1_kinematics import PivotKinematics, pose_from_posture, posture_from_pose
 from hal.z1_protocol.controller import (
     KD_PASSIVE,
     LABELS,
@@ -28,7 +29,7 @@ from hal.z1_protocol.controller import (
     encode_state,
 )
 from hal.z1_protocol.records import KD_SCALE, KP_SCALE, JointCommands, JointStates, ProtocolError
-from hal.z1_protocol.states import MOVES, Fsm, granted
+from hal.z1_protocol.states import MOVES, Fsm, is_granted
 
 _INERTIA = 0.2
 _VISCOUS = 0.5
@@ -42,12 +43,12 @@ def gravity_model() -> FeedForward:
 
 
 @cache
-def gripper_model() -> Z1Model:
-    return Z1Model.with_gripper()
+def pivot_kinematics() -> PivotKinematics:
+    return PivotKinematics()
 
 
 class FakeController:
-    """States, transitions and motion of the controller; `handle` is its whole contact with the world."""
+    """States, transitions and motion of the controller, driven by `handle` alone."""
 
     def __init__(self, clock: Clock, q: np.ndarray | None = None) -> None:
         self.clock = clock
@@ -61,47 +62,47 @@ class FakeController:
         self._goal: np.ndarray | None = None
         self._moved_s = clock.now_s()
         self._frozen: bytes | None = None
-        self._told = JointStates(q=self.q)
+        self._reported = JointStates(q=self.q)
         self.error = np.zeros((z1.N_JOINTS, 2), dtype=np.uint8)
         """(7, 2) error bits of the motors."""
         self.link = np.zeros((z1.N_JOINTS, 2), dtype=np.uint8)
         """(7, 2) link states of the motors."""
         self.temperature_c = np.full((z1.N_JOINTS, 2), 30, dtype=np.int8)
         """(7, 2) temperatures of the motors [°C]."""
-        self.refuses: set[Fsm] = set()
-        """States it does not go to, whatever its rules say."""
+        self.ignored_requests: set[Fsm] = set()
+        """States whose requests it ignores."""
         self.mute = False
-        """It gives no answers while this is set."""
+        """It does not answer while this is set."""
         self.stuck: int | None = None
-        """A joint that does not move, whatever is commanded."""
+        """A blocked joint."""
         self.rests = False
-        """It lies on something that carries it in PASSIVE."""
+        """The arm is supported in PASSIVE."""
         self.load = np.zeros(z1.N_JOINTS)
-        """(7,) what pulls at the joints beside gravity [Nm]."""
+        """(7,) load on the joints in addition to gravity [Nm]."""
         self.noise_rad = 0.0
-        """Of the measured positions."""
+        """Standard deviation of the measured positions."""
         self._rng = np.random.default_rng(0)
         self.received: list[Command] = []
-        """Every command that could be read."""
-        self.refused = 0
-        """Datagrams that could not."""
+        """Every valid command."""
+        self.invalid_datagrams = 0
+        """Datagrams that could not be decoded."""
         self.highest_torque = np.zeros(z1.N_JOINTS)
-        """(7,) the most that a command in LOWCMD meant at the last state that was told [Nm]."""
+        """(7,) maximum torque of a command in LOWCMD at the last reported state [Nm]."""
 
     def handle(self, data: bytes) -> bytes | None:
-        """Take a datagram; return the answer."""
+        """Process a datagram; return the answer."""
         self.move()
         try:
             command = decode_command(data)
-            self._obey(command)
+            self._execute(command)
         except ProtocolError:
-            self.refused += 1
+            self.invalid_datagrams += 1
             return None
         self.received.append(command)
         return None if self.mute else self.answer()
 
     def answer(self) -> bytes:
-        """Return what it tells, the last measurement again while its board is silent."""
+        """Return the answer, with the last measurement repeated while its board is silent."""
         if self._frozen is not None:
             return self._frozen
         joints = JointStates(
@@ -112,20 +113,20 @@ class FakeController:
             error=self.error,
             link=self.link,
         )
-        self._told = joints
+        self._reported = joints
         return encode_state(ControllerState(state=self.fsm, joints=joints, pose=self.pose()))
 
     def pose(self) -> np.ndarray:
         """Return roll, pitch, yaw, x, y, z (6,) of the pivot."""
-        return homoToPosture(gripper_model().forwardKinematics(self.q[:6]))
+        return posture_from_pose(pivot_kinematics().forward(self.q[:6]))
 
     def silence_board(self, silent: bool) -> None:
-        """Let the arm board say nothing, or speak again."""
+        """Silence the motor board, or let it answer again."""
         self._frozen = self.answer() if silent else None
 
-    def _obey(self, command: Command) -> None:
+    def _execute(self, command: Command) -> None:
         if command.state not in (Fsm.INVALID, self.fsm):
-            if not granted(self.fsm, command.state) or command.state in self.refuses:
+            if not is_granted(self.fsm, command.state) or command.state in self.ignored_requests:
                 return
             if command.state in MOVES and not self._set_goal(command):
                 return
@@ -135,25 +136,27 @@ class FakeController:
             self.target = command.joints().q
         elif self.fsm is Fsm.LOWCMD:
             self.commands = command.joints()
-            asked = np.abs(motor_torques(self.commands, self._told))
-            self.highest_torque = np.maximum(self.highest_torque, asked)
+            torque = np.abs(motor_torques(self.commands, self._reported))
+            self.highest_torque = np.maximum(self.highest_torque, torque)
 
     def _set_goal(self, command: Command) -> bool:
-        """Where the controller's own motion ends; the way there is a line in joint space, whatever was asked."""
-        self._goal = self.q.copy()
+        """Set the goal of a controller motion, always a line in joint space; return whether it is reachable."""
         if command.state in (Fsm.MOVEJ, Fsm.MOVEL, Fsm.MOVEC):
             move = command.trajectory()
-            pose = postureToHomo(move.poses[1 if command.state is Fsm.MOVEC else 0])
-            reachable, self._goal[:6] = gripper_model().inverseKinematics(pose, self.q[:6], True)
-            self._goal[6] = move.gripper_rad
-            return reachable
+            pose = pose_from_posture(move.poses[1 if command.state is Fsm.MOVEC else 0])
+            q = pivot_kinematics().inverse(pose, self.q[:6])
+            if q is None:
+                return False
+            self._goal = np.append(q, move.gripper_rad)
+            return True
         label = command.label() if command.state is Fsm.TOSTATE else "startFlat"
-        if label in LABELS:
-            self._goal[:6] = LABELS[label]
-        return label in LABELS
+        if label not in LABELS:
+            return False
+        self._goal = np.append(LABELS[label], self.q[6])
+        return True
 
     def move(self) -> None:
-        """Move on to the present."""
+        """Advance to the present time."""
         now_s = self.clock.now_s()
         while self._moved_s < now_s - 1e-9:
             dt_s = min(0.002, now_s - self._moved_s)
@@ -195,13 +198,13 @@ class FakeController:
 
 
 class Peer(Protocol):
-    """Who answers datagrams."""
+    """Peer that answers datagrams."""
 
     def handle(self, data: bytes) -> bytes | None: ...
 
 
 class MemoryLink:
-    """The way to a controller within one process and one clock; `mangle` may do anything to what passes."""
+    """Datagram link to a controller within one process and one clock; `mangle` may alter every datagram."""
 
     def __init__(self, peer: Peer, clock: Clock, latency_s: float = 0.001, name: str = "the fake controller") -> None:
         self.name = name
@@ -256,7 +259,7 @@ def serving(peer: FakeController) -> Iterator[tuple[int, int]]:
                     answer = peer.handle(inlet.recv(65536))
                     if answer is not None:
                         inlet.sendto(answer, ("127.0.0.1", state_port))
-                except OSError:  # nothing came, or the client is gone
+                except OSError:  # no datagram, or no client
                     continue
 
         thread = Thread(target=run, daemon=True)
@@ -268,15 +271,15 @@ def serving(peer: FakeController) -> Iterator[tuple[int, int]]:
             thread.join()
 
 
-def mangled(rng: np.random.Generator, share: float) -> Callable[[bytes], list[bytes]]:
-    """Return a `MemoryLink.mangle` under which `share` of the datagrams is lost, doubled, late, cut, too long, changed
-    or replaced by noise."""
+def mangle_at_random(rng: np.random.Generator, ratio: float) -> Callable[[bytes], list[bytes]]:
+    """Return a `MemoryLink.mangle` that makes a `ratio` of the datagrams lost, doubled, late, cut, too long, changed or
+    random."""
     late: list[bytes] = []
 
     def mangle(data: bytes) -> list[bytes]:
         passed = [*late]
         late.clear()
-        if rng.random() >= share:
+        if rng.random() >= ratio:
             return [*passed, data]
         changed = bytearray(data)
         changed[rng.integers(len(data))] ^= 1 << int(rng.integers(8))

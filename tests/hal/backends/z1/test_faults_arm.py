@@ -1,4 +1,4 @@
-"""Faults of the arm and of the program behind its driver: what the arm does, how fast, and what the operator reads."""
+"""Faults of the arm and of its controller: the arm's reaction, its duration, and the operator's message."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from hal.z1_protocol.controller import encode_command
 from hal.z1_protocol.records import MotorError, MotorLink
 from hal.z1_protocol.states import Fsm
 from tests.support.faults_table import FaultsTable
-from tests.support.hal.wired_bench import WiredBench
+from tests.support.hal.wire_bench import WireBench
 
 pytestmark = pytest.mark.faults
 
@@ -30,61 +30,61 @@ pytestmark = pytest.mark.faults
 def test_a_motors_fault_bit(
     motor: tuple[int, int], field: str, value: MotorError | MotorLink, faults_table: FaultsTable
 ) -> None:
-    bench = WiredBench()
+    bench = WireBench()
     bench.play(lambda: getattr(bench.twin.motors, field).__setitem__(motor, value))
     bench.assert_safe()
     assert bench.status.mode is ServoMode.STOPPED
     assert z1.JOINT_NAMES[motor[0]] in bench.status.reason
-    bench.tell(faults_table, f"motor {field} bit {value.name.lower().replace('_', ' ')}")
+    bench.report(faults_table, f"motor {field} bit {value.name.lower().replace('_', ' ')}")
 
 
 @pytest.mark.parametrize("mode", [Z1Mode.TRACKING, Z1Mode.LOW_LEVEL])
-def test_a_board_that_falls_silent(mode: Z1Mode, faults_table: FaultsTable) -> None:
-    bench = WiredBench(mode)
+def test_a_motor_board_that_falls_silent(mode: Z1Mode, faults_table: FaultsTable) -> None:
+    bench = WireBench(mode)
     bench.play(lambda: setattr(bench.twin.motors, "silent", True))
     bench.assert_safe()
     assert bench.status.mode is ServoMode.STOPPED
-    assert "the arm itself is silent" in bench.status.reason
-    bench.tell(faults_table, f"arm board silent ({mode})")
+    assert "repeated one measurement" in bench.status.reason
+    bench.report(faults_table, f"motor board silent ({mode})")
 
 
 @pytest.mark.parametrize("mode", [Z1Mode.TRACKING, Z1Mode.LOW_LEVEL])
-def test_a_controller_that_is_gone(mode: Z1Mode, faults_table: FaultsTable) -> None:
-    bench = WiredBench(mode)
+def test_a_controller_without_answers(mode: Z1Mode, faults_table: FaultsTable) -> None:
+    bench = WireBench(mode)
     bench.play(lambda: setattr(bench.link, "mangle", lambda data: []))
     bench.assert_safe()
     assert bench.status.mode is ServoMode.STOPPED
     assert "has not answered" in bench.status.reason
-    bench.tell(faults_table, f"controller gone, or its cable ({mode})")
+    bench.report(faults_table, f"controller ended, or its cable unplugged ({mode})")
 
 
-def test_a_controller_switched_by_somebody_else(faults_table: FaultsTable) -> None:
-    bench = WiredBench()
-    bench.play(lambda: bench.twin.take(encode_command(Fsm.CARTESIAN)) and None)
+def test_a_controller_switched_by_another_program(faults_table: FaultsTable) -> None:
+    bench = WireBench()
+    bench.play(lambda: bench.twin.receive(encode_command(Fsm.CARTESIAN)))
     bench.assert_safe()
     assert bench.status.mode is ServoMode.STOPPED
-    assert "from JOINTCTRL to CARTESIAN unasked" in bench.status.reason
-    bench.tell(faults_table, "controller switched by another program")
+    assert "from JOINTCTRL to CARTESIAN without a request" in bench.status.reason
+    bench.report(faults_table, "controller switched by another program")
 
 
 def test_a_clock_that_jumps(faults_table: FaultsTable) -> None:
-    bench = WiredBench()
+    bench = WireBench()
     bench.play(lambda: setattr(bench.clock, "ahead_s", 3600.0))
     bench.assert_safe()
     assert bench.status.mode is not ServoMode.TRACKING
-    bench.tell(faults_table, "clock jumps by 1 h, as after a suspend")
+    bench.report(faults_table, "clock jumps by 1 h, as after a suspend")
 
 
 def test_a_push_that_is_stronger_than_a_motor(faults_table: FaultsTable) -> None:
     push_nm, push_s = 33.0, 0.3
-    bench = WiredBench()
+    bench = WireBench()
 
     def push() -> None:
-        lasts = bench.world.time_s < bench.fault_s + push_s
-        bench.world.data.qfrc_applied[0] = -push_nm if lasts else 0.0
+        pushing = bench.world.time_s < bench.fault_s + push_s
+        bench.world.data.qfrc_applied[0] = -push_nm if pushing else 0.0
 
     bench.play(lambda: bench.twin_clock.call_every_tick(push))
     bench.assert_safe()
     assert bench.status.mode is ServoMode.STOPPED
     assert bench.status.reason.startswith("joint1")
-    bench.tell(faults_table, f"joint1 pushed back with {push_nm:.0f} Nm for {push_s:.1f} s")
+    bench.report(faults_table, f"joint1 pushed back with {push_nm:.0f} Nm for {push_s:.1f} s")

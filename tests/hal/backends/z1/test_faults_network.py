@@ -1,4 +1,4 @@
-"""A bad network between the real Z1's driver and its arm, and whoever else sends to their ports."""
+"""A bad network between the real Z1's driver and its arm, and other senders to their ports."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from hal.base.messages import ServoMode
 from hal.z1_protocol.controller import COMMAND_SIZE, STATE_SIZE
 from tests.support.faults_table import FaultsTable
 from tests.support.hal.bad_network import FATES, BadNetwork
-from tests.support.hal.wired_bench import WiredBench
+from tests.support.hal.wire_bench import WireBench
 
 pytestmark = pytest.mark.faults
 
@@ -19,18 +19,18 @@ FUZZ = 100_000
 
 @pytest.mark.parametrize("fate", FATES)
 def test_a_tenth_of_all_datagrams(fate: str, faults_table: FaultsTable) -> None:
-    bench = WiredBench()
+    bench = WireBench()
     network = BadNetwork(FATES[fate])
     bench.play(lambda: setattr(bench.link, "mangle", network))
     assert network.touched > 100
     bench.assert_safe()
     assert bench.status.finished or bench.status.mode is ServoMode.STOPPED
-    bench.tell(faults_table, f"10 % of all datagrams {fate}")
+    bench.report(faults_table, f"10 % of all datagrams {fate}")
 
 
 def test_random_datagrams(faults_table: FaultsTable) -> None:
     """Of any size, of the right size, and with the right head as well; half of them to the arm, half to the driver."""
-    bench = WiredBench(Z1Mode.LOW_LEVEL)
+    bench = WireBench(Z1Mode.LOW_LEVEL)
     rng = np.random.default_rng(0)
     per_tick = 100
     sent = 0
@@ -49,6 +49,6 @@ def test_random_datagrams(faults_table: FaultsTable) -> None:
 
     bench.play(lambda: setattr(bench.link, "mangle", flood))
     assert sent >= FUZZ
-    assert bench.twin.refused + bench.arm.diagnostics().counts.refused > 0.9 * FUZZ
+    assert bench.twin.invalid_datagrams + bench.arm.diagnostics().counts.invalid > 0.9 * FUZZ
     bench.assert_safe()
-    bench.tell(faults_table, f"{sent:,} random datagrams")
+    bench.report(faults_table, f"{sent:,} random datagrams")

@@ -1,4 +1,4 @@
-"""Scripts written for the vendor's Python module run on ours."""
+"""Scripts for the vendor's Python module run on ours."""
 
 from __future__ import annotations
 
@@ -14,11 +14,12 @@ import hal.compat.unitree_arm_interface as vendor
 from hal.backends.z1.arm import Z1Arm
 from hal.base import z1
 from hal.base.clock import ManualClock, WallClock
-from hal.base.errors import HalTimeoutError
+from hal.base.errors import HalTimeoutError, InvalidMessageError
 from hal.compat.unitree_arm_interface import ArmFSMState, ArmInterface
 from hal.z1_protocol.controller import LABELS
 from hal.z1_protocol.states import Fsm
-from tests.support.hal.z1_peer import FakeController, MemoryLink, gripper_model, serving
+from tests.support.errors import raises
+from tests.support.hal.z1_peer import FakeController, MemoryLink, pivot_kinematics, serving
 
 FORWARD = LABELS["forward"]
 
@@ -30,9 +31,9 @@ def clock() -> ManualClock:
 
 @pytest.fixture
 def peer(clock: ManualClock) -> FakeController:
-    made = FakeController(clock)
-    made.rests = True
-    return made
+    peer = FakeController(clock)
+    peer.rests = True
+    return peer
 
 
 @pytest.fixture
@@ -40,9 +41,9 @@ def arm(peer: FakeController, clock: ManualClock, monkeypatch: pytest.MonkeyPatc
     """An interface by the clock of the test, without a thread: the test calls `sendRecv` itself."""
     link = MemoryLink(peer, clock)
     monkeypatch.setattr(ArmInterface, "make_arm", staticmethod(lambda config: Z1Arm(clock, config, link=link)))
-    made = ArmInterface(hasGripper=True)
-    yield made
-    made._close()
+    arm = ArmInterface(hasGripper=True)
+    yield arm
+    arm._close()
 
 
 def cycle(arm: ArmInterface, clock: ManualClock, times: int = 1) -> None:
@@ -52,7 +53,7 @@ def cycle(arm: ArmInterface, clock: ManualClock, times: int = 1) -> None:
 
 
 def test_the_names_are_the_vendors() -> None:
-    """Of its stub file and its bindings: classes, and what they have."""
+    """Classes and members of the vendor's stub file and bindings."""
     for name in ("postureToHomo", "homoToPosture", "ArmFSMState", "LowlevelState", "CtrlComponents", "Z1Model"):
         assert hasattr(vendor, name)
     methods = (
@@ -72,7 +73,7 @@ def test_the_names_are_the_vendors() -> None:
     assert ArmFSMState.LOWCMD == 16
 
 
-def test_it_is_imported_under_the_vendors_name_when_asked_for() -> None:
+def test_it_is_imported_under_the_vendors_name_on_request() -> None:
     assert "unitree_arm_interface" not in sys.modules
     with vendor.masquerade():
         import unitree_arm_interface  # pyright: ignore[reportMissingImports]
@@ -81,7 +82,7 @@ def test_it_is_imported_under_the_vendors_name_when_asked_for() -> None:
     assert "unitree_arm_interface" not in sys.modules
 
 
-def test_a_label_is_run_from_passive_and_lowstate_tells_where_the_arm_is(arm: ArmInterface, clock: ManualClock) -> None:
+def test_a_label_is_run_from_passive_and_lowstate_is_updated(arm: ArmInterface, clock: ManualClock) -> None:
     assert arm.getCurrentState() is ArmFSMState.PASSIVE
     assert arm.labelRun("forward")
     cycle(arm, clock)
@@ -91,13 +92,13 @@ def test_a_label_is_run_from_passive_and_lowstate_tells_where_the_arm_is(arm: Ar
     assert len(arm.lowstate.temperature) == len(arm.lowstate.errorstate) == 8
 
 
-def test_what_cannot_be_done_is_false_and_in_the_log(
+def test_impossible_requests_return_false_and_are_logged(
     arm: ArmInterface, peer: FakeController, caplog: pytest.LogCaptureFixture
 ) -> None:
     assert not arm.labelRun("nowhere")
-    assert "stays in JOINTCTRL when asked for TOSTATE" in caplog.text
+    assert "the controller stays in JOINTCTRL" in caplog.text
     assert not arm.MoveJ(np.array([0, 0, 0, 2.0, 0, 0]), 1.0)
-    assert "no joints within the limits reach the posture" in caplog.text
+    assert "is unreachable within the joint limits" in caplog.text
     assert not arm.setFsm(ArmFSMState.LOWCMD)
     assert "Only PASSIVE can go to LOWCMD" in caplog.text
     arm.startTrack(ArmFSMState.TEACH)
@@ -105,7 +106,7 @@ def test_what_cannot_be_done_is_false_and_in_the_log(
     assert peer.fsm is Fsm.JOINTCTRL
 
 
-def test_moves_go_where_they_should_with_and_without_the_gripper(arm: ArmInterface, peer: FakeController) -> None:
+def test_moves_reach_their_goals_with_and_without_the_gripper(arm: ArmInterface, peer: FakeController) -> None:
     arm.labelRun("forward")
     assert arm.MoveJ(np.array([0.5, 0.1, 0.1, 0.5, -0.2, 0.5]), -1.0, 1.0)
     assert peer.pose() == pytest.approx([0.5, 0.1, 0.1, 0.5, -0.2, 0.5], abs=0.01)
@@ -118,7 +119,7 @@ def test_moves_go_where_they_should_with_and_without_the_gripper(arm: ArmInterfa
     sent = [c.trajectory() for c in peer.received if c.state is Fsm.MOVEC]
     assert sent[-1].gripper_rad == 0.0
     assert sent[-1].max_speed == 1.0
-    with pytest.raises(TypeError, match="arguments came"):
+    with pytest.raises(TypeError):
         arm.MoveJ(np.zeros(6))
 
 
@@ -148,7 +149,7 @@ def test_joints_are_jogged(arm: ArmInterface, peer: FakeController, clock: Manua
     assert peer.q[3] == pytest.approx(z1.Q_MIN[3], abs=1e-3)
 
 
-def test_a_far_target_is_approached_at_the_highest_speed(
+def test_a_far_target_is_approached_at_the_maximum_speed(
     arm: ArmInterface, peer: FakeController, clock: ManualClock
 ) -> None:
     arm.labelRun("forward")
@@ -162,7 +163,7 @@ def test_a_far_target_is_approached_at_the_highest_speed(
     assert peer.q[6] == pytest.approx(z1.Q_MIN[6], abs=1e-3)
 
 
-def test_the_posture_is_jogged_and_stops_when_nobody_asks_any_more(
+def test_the_posture_is_jogged_and_stops_without_commands(
     arm: ArmInterface, peer: FakeController, clock: ManualClock
 ) -> None:
     arm.labelRun("forward")
@@ -199,7 +200,7 @@ def test_low_level_commands_reach_the_motors_within_their_limits(
     cycle(arm, clock)
     assert (np.abs(peer.received[-1].joints().tau[:6]) <= z1.TAU_MAX[:6] + 1e-3).all()
     arm.tau = np.array([0, 0, np.nan, 0, 0, 0])
-    with pytest.raises(ValueError, match="must be finite"):
+    with raises(InvalidMessageError, "invalid_message"):
         cycle(arm, clock)
     assert arm.backToStart()
     assert peer.q[:6] == pytest.approx(LABELS["startFlat"], abs=0.01)
@@ -216,7 +217,7 @@ def test_gains_of_the_low_level_mode_are_forwarded(arm: ArmInterface, peer: Fake
     assert peer.received[-1].joints().kp.tolist() == [20, 30, 30, 20, 15, 10, 0]
 
 
-def test_teaching_goes_on_until_another_state_is_asked_for(arm: ArmInterface, peer: FakeController) -> None:
+def test_teaching_continues_until_another_state_is_requested(arm: ArmInterface, peer: FakeController) -> None:
     assert arm.teach("mine")
     assert peer.fsm is Fsm.TEACH
     assert [c.label() for c in peer.received if c.state is Fsm.TEACH][-1] == "mine"
@@ -256,10 +257,11 @@ arm.loopOff()
 """
 
 
+@pytest.mark.integration
 def test_a_script_of_the_vendors_kind_runs_unmodified(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     peer = FakeController(WallClock())
     peer.rests = True
-    gripper_model().inverseKinematics(gripper_model().forwardKinematics(FORWARD), FORWARD)  # compiles the solver
+    pivot_kinematics().inverse(pivot_kinematics().forward(FORWARD), FORWARD)  # compiles the solver
     script = tmp_path / "script.py"
     script.write_text(SCRIPT)
     with serving(peer) as (command_port, state_port), vendor.masquerade():
@@ -273,8 +275,9 @@ def test_a_script_of_the_vendors_kind_runs_unmodified(tmp_path: Path, monkeypatc
     assert peer.fsm is Fsm.JOINTCTRL
 
 
-def test_with_nobody_there_a_script_ends_with_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.integration
+def test_without_a_controller_a_script_ends_with_the_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ArmInterface, "udp", vendor.UDPPort("127.0.0.1", 9, 0xFFFF))
     arm = ArmInterface()
-    with pytest.raises(HalTimeoutError, match=r"127\.0\.0\.1:9 .*z1_ctrl"):
+    with raises(HalTimeoutError, "no_controller"):
         arm.loopOn()

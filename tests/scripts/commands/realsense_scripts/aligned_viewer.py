@@ -1,4 +1,4 @@
-"""Aligns depth to colour, blanks the background, and shows both until a key is pressed; expects any D400."""
+"""Viewer of depth aligned to colour, without the background, until a key is pressed; for any D400."""
 
 import argparse
 

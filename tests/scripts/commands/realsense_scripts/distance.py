@@ -1,4 +1,4 @@
-"""Prints how far away the middle of the picture is, ten times, and a coarse picture of the depth in letters."""
+"""Printer of the depth at the image's centre, ten times, and of a coarse depth image in letters."""
 
 import pyrealsense2 as rs
 

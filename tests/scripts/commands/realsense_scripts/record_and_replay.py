@@ -1,4 +1,4 @@
-"""Records a second with filters at work, writes a cloud, then plays the recording."""
+"""Recorder of a second with filters, of a point cloud, and replay of the recording."""
 
 import sys
 

@@ -1,4 +1,4 @@
-"""The vendor's model alone: no controller is asked."""
+"""The vendor's model alone, without a controller."""
 
 import numpy as np
 import unitree_arm_interface as sdk

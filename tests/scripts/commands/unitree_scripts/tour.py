@@ -1,4 +1,4 @@
-"""Every way in which the vendor's module moves an arm, one after the other."""
+"""Every motion of the vendor's module, one after the other."""
 
 import sys
 import time
@@ -8,8 +8,8 @@ import numpy as np
 import unitree_arm_interface as sdk
 
 
-def line(what, value):
-    print(what, np.array2string(np.asarray(value, dtype=float), precision=3, suppress_small=True, max_line_width=200))
+def line(name, value):
+    print(name, np.array2string(np.asarray(value, dtype=float), precision=3, suppress_small=True, max_line_width=200))
 
 
 arm = sdk.ArmInterface(hasGripper=True)

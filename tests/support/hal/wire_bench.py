@@ -1,4 +1,4 @@
-"""The servo over the real Z1's driver over the twin's controller, in one process and on the twin's clock."""
+"""Servo over the real Z1's driver over the twin's controller, in one process and on the twin's clock."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from hal.backends.z1.arm import Z1Arm
 from hal.backends.z1.config import Z1ArmConfig, Z1Mode
-from hal.backends.z1.torque import motor_torques
+from hal.backends.z1.torque_limits import motor_torques
 from hal.base import z1
 from hal.base.messages import ServoMode, ServoStatus, TrajectoryChunk
 from hal.servo.servo import Servo
@@ -24,7 +24,7 @@ from tests.support.hal.z1_peer import MemoryLink
 PERIOD_S = z1.CONTROL_PERIOD_S
 MOVE_S = 1.2
 FAULT_AT_S = 0.4
-_LONGEST_S = 1.9
+_MAX_S = 1.9
 _BEAT_EVERY = 10
 _HEARTBEAT_TIMEOUT_S = 0.15
 _TOUCH_RAD = 5e-3
@@ -32,7 +32,7 @@ _MOVING_RAD_S = 0.02
 
 
 class Instant(NamedTuple):
-    """What is noted after a tick."""
+    """Record of one tick."""
 
     t_s: float
     q: np.ndarray
@@ -41,7 +41,7 @@ class Instant(NamedTuple):
 
 
 class JumpingClock:
-    """The twin's clock, and what it has been put forward by."""
+    """The twin's clock plus an offset."""
 
     def __init__(self, clock: TwinClock) -> None:
         self._clock = clock
@@ -54,85 +54,85 @@ class JumpingClock:
         self._clock.sleep_until(t_s - self.ahead_s)
 
 
-class WiredBench:
-    """A connected, claimed arm that plays one trajectory of joint 1 while something is broken."""
+class WireBench:
+    """A connected, claimed arm that executes one trajectory of joint 1 while a fault is injected."""
 
     def __init__(self, mode: Z1Mode = Z1Mode.TRACKING) -> None:
         self.world = World(SceneConfig())
         self.twin = ControlledWorld(self.world)
         self.twin_clock = TwinClock(self.world)
         self.twin_clock.call_every_tick(self.twin.tick)
-        self.twin_clock.call_every_tick(self._note_torque)
+        self.twin_clock.call_every_tick(self._record_torque)
         self.clock = JumpingClock(self.twin_clock)
         self.link = MemoryLink(self.twin, self.clock, name="the twin")
         self.arm = Z1Arm(self.clock, Z1ArmConfig(mode=mode), link=self.link)
         self.servo = Servo(self.arm, self.clock, heartbeat_timeout_s=_HEARTBEAT_TIMEOUT_S)
         self.highest_torque = np.zeros(z1.N_JOINTS)
-        """(7,) the most that the motors made [Nm]."""
-        self.highest_asked = np.zeros(z1.N_JOINTS)
-        """(7,) the most that the driver asked of them in low-level mode [Nm]."""
-        self.seen: list[Instant] = []
+        """(7,) maximum torque of the motors [Nm]."""
+        self.highest_commanded = np.zeros(z1.N_JOINTS)
+        """(7,) maximum torque commanded in low-level mode [Nm]."""
+        self.instants: list[Instant] = []
         self.servo.connect()
         self.servo.claim("test")
 
-    def play(self, break_it: Callable[[], None]) -> None:
-        """Play 0.8 rad of joint 1, break something on the way, and go on until all is over."""
+    def play(self, inject_fault: Callable[[], None]) -> None:
+        """Execute 0.8 rad of joint 1, inject a fault during the motion, and continue until the end."""
         self._stream()
-        for i in range(round(_LONGEST_S / PERIOD_S)):
+        for i in range(round(_MAX_S / PERIOD_S)):
             if i % _BEAT_EVERY == 0 and self.servo.status().owner:
                 self.servo.heartbeat()
             if i == round(FAULT_AT_S / PERIOD_S):
                 self.fault_s = self.world.time_s
-                break_it()
+                inject_fault()
             self.servo.tick()
-            self._note_asked()
+            self._record_commanded()
             self.clock.sleep_until(self.clock.now_s() + PERIOD_S)
             q, dq, _ = self.world.read_arm()
-            self.seen.append(Instant(self.world.time_s, q, dq, self.servo.status()))
+            self.instants.append(Instant(self.world.time_s, q, dq, self.servo.status()))
 
     @property
     def after(self) -> list[Instant]:
-        """What was seen since the fault."""
-        return [instant for instant in self.seen if instant.t_s > self.fault_s]
+        """Instants since the fault."""
+        return [instant for instant in self.instants if instant.t_s > self.fault_s]
 
     @property
     def status(self) -> ServoStatus:
         """The last one."""
-        return self.seen[-1].status
+        return self.instants[-1].status
 
-    def tell(self, table: FaultsTable, fault: str, reads: object = None) -> None:
-        """Add what was seen to `table`."""
+    def report(self, table: FaultsTable, fault: str, reads: object = None) -> None:
+        """Add the outcome to `table`."""
         first, status = self.after[0], self.status
-        behind = max(np.abs(i.q - i.status.q_command)[: z1.N_ARM].max() for i in self.after)
-        went_on = f"goes on to the end, at most {1e3 * behind:.0f} mrad behind its command"
+        lag = max(np.abs(i.q - i.status.q_command)[: z1.N_ARM].max() for i in self.after)
+        finished = f"continues to the end, at most {1e3 * lag:.0f} mrad behind its command"
         braked = describe(status, self.after[-1].q - first.q)
-        told = next((i.t_s for i in self.after if i.status.mode is not ServoMode.TRACKING), None)
+        noticed = next((i.t_s for i in self.after if i.status.mode is not ServoMode.TRACKING), None)
         moving = [i.t_s for i in self.after if np.abs(i.dq[: z1.N_ARM]).max() > _MOVING_RAD_S]
         table.add(
             fault,
-            arm=went_on if status.finished else braked,
-            noticed_s=None if status.finished or told is None else told - self.fault_s,
+            arm=finished if status.finished else braked,
+            noticed_s=None if status.finished or noticed is None else noticed - self.fault_s,
             rest_s=None if status.finished or not moving else moving[-1] - self.fault_s,
             reads=status.reason if reads is None else reads,
         )
 
     def assert_safe(self) -> None:
-        """Nothing went past a limit, neither the arm nor what its motors made."""
-        q = np.array([instant.q for instant in self.seen])
+        """Assert that positions and torques stayed within their limits."""
+        q = np.array([instant.q for instant in self.instants])
         assert (q >= z1.Q_MIN - _TOUCH_RAD).all()
         assert (q <= z1.Q_MAX + _TOUCH_RAD).all()
         assert (self.highest_torque <= z1.TAU_MAX + 1e-6).all()
-        assert (self.highest_asked <= np.append(z1.TAU_MAX[:6], self.arm.limits.grip_torque_nm) + 1e-3).all()
+        assert (self.highest_commanded <= np.append(z1.TAU_MAX[:6], self.arm.limits.grip_torque_nm) + 1e-3).all()
 
-    def _note_asked(self) -> None:
-        """Note what the driver's newest command means at its newest measurement."""
+    def _record_commanded(self) -> None:
+        """Record the torque of the driver's newest command at its newest measurement."""
         if self.arm.mode is Z1Mode.LOW_LEVEL:
             joints = self.arm._client.command.joints
             command = JointCommands(**{name: joints[name].astype(float) for name in ("q", "dq", "tau", "kp", "kd")})
-            asked = np.abs(motor_torques(command, self.arm.newest.joints))
-            self.highest_asked = np.maximum(self.highest_asked, asked)
+            torque = np.abs(motor_torques(command, self.arm.newest.joints))
+            self.highest_commanded = np.maximum(self.highest_commanded, torque)
 
-    def _note_torque(self) -> None:
+    def _record_torque(self) -> None:
         self.highest_torque = np.maximum(self.highest_torque, np.abs(self.world.read_arm()[2]))
 
     def _stream(self) -> None:

@@ -1,12 +1,14 @@
-"""What may be told to the vendor's controller next: wishes in, commands within all limits out."""
+"""Commands for the vendor's controller: setpoints in, commands within all limits out."""
 
 from __future__ import annotations
+
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from hal.backends.z1.client import Z1Client
 from hal.backends.z1.config import Z1Mode
-from hal.backends.z1.torque import FeedForward, limit_commands
+from hal.backends.z1.torque_limits import limit_commands
 from hal.base import z1
 from hal.base.errors import HalTimeoutError
 from hal.base.messages import ArmSetpoint
@@ -15,7 +17,11 @@ from hal.z1_protocol.controller import KD_JOINTCTRL, KD_LOWCMD, KP_LOWCMD
 from hal.z1_protocol.records import JointCommands
 from hal.z1_protocol.states import Fsm
 
-_MAX_LEAD_RAD = 0.35  # above the servo's following error, so that the servo is the one to notice and to say so
+if TYPE_CHECKING:
+    from hal.base.z1_dynamics import FeedForward
+
+_MAX_LEAD_RAD = 0.35  # above the servo's following-error limit, so that the servo reports a blocked arm first
+# The controller repeats its last measurement while its motor board is silent (measured on the vendor's controller).
 _STALE_S = 0.1
 _STALE_RAD = 0.05
 _STILL_RAD = 0.001
@@ -24,12 +30,12 @@ _REST = np.zeros(z1.N_JOINTS)
 _REST.setflags(write=False)
 
 
-class Z1Commands:
-    """Writes into the client's command; nothing is sent here.
+class CommandWriter:
+    """Limits every command and writes it into the client's buffer; it sends nothing, and expects the driver's lock.
 
     Args:
-        client: whose command is written.
-        limits: what every command is clipped to.
+        client: owner of the command buffer.
+        limits: limits of every command.
     """
 
     def __init__(self, client: Z1Client, limits: ServoLimits) -> None:
@@ -37,31 +43,33 @@ class Z1Commands:
         self._limits = limits
         self._feed_forward: FeedForward | None = None
         self.mode = Z1Mode.OBSERVE
+        """Format of the commands written."""
         self.grip_nm: float | None = None
-        """Torque of the gripper [Nm]; None = it goes to a position."""
+        """Torque of the gripper [Nm]; None = position control."""
         self.q_sent = self._still_q = _REST
         """(7,) last position commanded [rad]."""
         self._still_s = 0.0
 
-    def take_over(self, mode: Z1Mode) -> None:
+    def start_mode(self, mode: Z1Mode) -> None:
         """Start a mode with the command equal to the measurement."""
         self.mode = mode
         self.q_sent = self._still_q = self._client.newest.joints.q
         self._still_s = self._client.newest_s
         if mode is Z1Mode.LOW_LEVEL and self._feed_forward is None:
+            from hal.base.z1_dynamics import FeedForward  # pinocchio is loaded only where torques are needed
+
             self._feed_forward = FeedForward()
 
-    def hold(self) -> None:
-        """Command the last position once more, at rest."""
+    def write_hold(self) -> None:
+        """Write the last position once more, at rest."""
         if self.mode is not Z1Mode.OBSERVE:
             self._write(self.q_sent, _REST)
 
-    def follow(self, setpoint: ArmSetpoint) -> ArmSetpoint:
-        """Command what is nearest to `setpoint`; return it.
+    def write_setpoint(self, setpoint: ArmSetpoint) -> ArmSetpoint:
+        """Write the command nearest to `setpoint` within all limits, and return it.
 
-        In this order: `hal.servo.limits.clip_setpoint` (joint limits, grip torque, one period's step at the
-        highest speed),
-        the lead over the measurement, and in low-level mode the torques.
+        In this order: `hal.servo.limits.clip_setpoint` (joint limits, grip torque, maximum step of one period), the
+        lead over the measurement, and in low-level mode the torques.
         """
         joints = self._client.newest.joints
         measured, q, dq = joints.q, setpoint.q, setpoint.dq
@@ -74,72 +82,71 @@ class Z1Commands:
         self.q_sent = q
         return ArmSetpoint(q=q, dq=dq)
 
-    def follow_motors(self, wish: JointCommands) -> JointCommands:
-        """Command the motors directly, in low-level mode; return what is left after all limits.
+    def write_motor_commands(self, desired: JointCommands) -> JointCommands:
+        """Write motor commands within all limits, in low-level mode, and return them.
 
         Raises:
             InvalidMessageError: values that are not finite.
         """
-        allowed = self._limited(wish)
+        allowed = self._limit(desired)
         self._write_motors(allowed)
         self.q_sent = allowed.q
         return allowed
 
-    def entry(self) -> JointCommands:
-        """Return the first command of the low-level mode: the measurement, at rest."""
-        self.take_over(Z1Mode.LOW_LEVEL)
-        return self._balanced(self._client.newest.joints.q, _REST)
+    def make_entry_command(self) -> JointCommands:
+        """Start the low-level mode and return its first command: the measurement, at rest."""
+        self.start_mode(Z1Mode.LOW_LEVEL)
+        return self._compensate(self._client.newest.joints.q, _REST)
 
-    def check_measurements(self) -> None:
-        """Raise when the arm is told to move and the same measurement comes again and again.
-
-        The controller goes on answering when its arm board does not, with the last that it heard.
+    def check_freshness(self) -> None:
+        """Check that the measurements change while the arm is commanded to move.
 
         Raises:
-            HalTimeoutError: so it is.
+            HalTimeoutError: the controller repeats one measurement.
         """
         client = self._client
-        told = np.abs(self.q_sent - self._still_q)[:_GRIPPER].max()
-        if told < _STILL_RAD or client.changed_s > self._still_s:
+        commanded = np.abs(self.q_sent - self._still_q)[:_GRIPPER].max()
+        if commanded < _STILL_RAD or client.changed_s > self._still_s:
             self._still_q, self._still_s = self.q_sent, client.newest_s
             return
         silent_s = client.newest_s - self._still_s
-        if silent_s > _STALE_S and told > _STALE_RAD:
+        if silent_s > _STALE_S and commanded > _STALE_RAD:
             raise HalTimeoutError(
-                f"the controller has repeated one measurement for {silent_s:.2f} s while the arm was told to move by "
-                f"{told:.2f} rad (allowed: {_STALE_S} s or {_STALE_RAD} rad): the arm itself is silent, or "
-                f"blocked. Check its power, its network cable, and what it touches."
+                f"Z1: the controller has repeated one measurement for {silent_s:.2f} s during a commanded motion of "
+                f"{commanded:.2f} rad (allowed {_STALE_S} s or {_STALE_RAD} rad): the motor board is silent or the arm "
+                f"is blocked. Check its power, its network cable, and its contacts.",
+                code="stale_measurement",
             )
 
     # --- Inside -------------------------------------------------------------------------------------------------
 
     def _write(self, q: np.ndarray, dq: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Write a command; return what of it is left after the torque limits."""
+        """Write a command; return the part of it within the torque limits."""
         if self.mode is Z1Mode.LOW_LEVEL:
-            allowed = self._balanced(q, dq)
+            allowed = self._compensate(q, dq)
             self._write_motors(allowed)
             return allowed.q, allowed.dq
         joints = self._client.command.joints
         joints["q"] = q
         joints["dq"] = dq
-        self._client.command.head(Fsm.INVALID, track=True)
+        self._client.command.set_head(Fsm.INVALID, track=True)
         return q, dq
 
     def _write_motors(self, commands: JointCommands) -> None:
         joints = self._client.command.joints
         for name in ("q", "dq", "tau", "kp", "kd"):
             joints[name] = getattr(commands, name)
-        self._client.command.head(Fsm.INVALID, track=False)
+        self._client.command.set_head(Fsm.INVALID, track=False)
 
-    def _balanced(self, q: np.ndarray, dq: np.ndarray) -> JointCommands:
-        """Return the motors' commands for a setpoint: usual gains, gravity and friction compensated."""
+    def _compensate(self, q: np.ndarray, dq: np.ndarray) -> JointCommands:
+        """Return the motors' commands for a setpoint: default gains, gravity and friction compensated."""
         assert self._feed_forward is not None
         kp, kd, tau = KP_LOWCMD, KD_LOWCMD, self._feed_forward.torque(q, dq)
         if self.grip_nm is not None:
             kp, kd = kp.copy(), kd.copy()
             kp[_GRIPPER], kd[_GRIPPER] = 0.0, KD_JOINTCTRL[_GRIPPER]
             tau[_GRIPPER] += self.grip_nm
-        return self._limited(JointCommands(q=q, dq=dq, tau=tau, kp=kp, kd=kd))
+        return self._limit(JointCommands(q=q, dq=dq, tau=tau, kp=kp, kd=kd))
 
-    def _limited(self, wish: JointCommands) -> JointCommands:
-        return limit_commands(wish, self._client.newest.joints, self._limits)
+    def _limit(self, desired: JointCommands) -> JointCommands:
+        return limit_commands(desired, self._client.newest.joints, self._limits)
