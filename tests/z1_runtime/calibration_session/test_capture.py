@@ -17,10 +17,11 @@ from hal.base import z1
 from hal.base.messages import ArmState, RgbdFrame
 from hal.base.transforms import pose_error
 from scripts.support.calibration_robot import CalibrationRobot, RobotOptions, open_robot
-from scripts.support.demo_robot import lockstep_robot
+from sim_twin.backends import make_rig
 from sim_twin.model.scene import SceneConfig
 from z1_runtime.calibration_session.board_search import BoardSearch, still_frame
 from z1_runtime.calibration_session.capture import Capture, Key
+from z1_runtime.devices import connect_rig
 from z1_runtime.geometry.kinematics import Kinematics
 from z1_runtime.motion.executor import Executor, MotionError
 from z1_runtime.motion.trajectory import MotionLimits, joint_move
@@ -138,7 +139,7 @@ def test_an_operator_takes_and_ends_by_hand_and_nothing_moves_the_arm(robot: Cal
 
 def test_a_table_without_the_board_is_told(tmp_path: Path):
     with ExitStack() as undo:
-        robot = undo.enter_context(lockstep_robot(SceneConfig(object="box")))
+        robot = undo.enter_context(connect_rig(make_rig(SceneConfig(object="box"), lockstep=True)))
         robot.arm.claim("test")
         devices = {"arm": robot.arm, "camera": robot.camera, "clock": robot.clock, "board": BOARD}
         capture = Capture(**devices, folder=tmp_path)
