@@ -57,7 +57,7 @@ class Config:
     """Core of the servo's thread, best one isolated from others (`isolcpus`); by default any."""
     until_stdin_closes: bool = False
     """End when standard input closes, so that this process brakes and ends with its parent."""
-    options_from_stdin: tyro.conf.Suppress[bool] = False
+    options_from_stdin: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Read rig, scene and bus from the first line of standard input, and end when it closes (`HalProcess`)."""
 
 
