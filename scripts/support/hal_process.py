@@ -14,7 +14,7 @@ from scripts.support.scene_options import SceneOptions
 
 READY = "ready"
 """Line that a HAL process prints when it accepts requests."""
-_SHUTDOWN_S = 10.0  # braking takes under 1 s; the rest is for Zenoh and the renderer
+_SHUTDOWN_S = 10.0
 _EXIT_S = 0.5  # the link may break before the process has exited
 
 
