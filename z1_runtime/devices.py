@@ -30,10 +30,14 @@ class Devices:
 
 
 @contextmanager
-def connect_rig(rig: Rig) -> Iterator[Devices]:
+def connect_rig(rig: Rig, *, camera: bool = True) -> Iterator[Devices]:
     """Yield the devices of `rig` under a servo with the default workspace guard; its lease is free.
 
     In lock-step the same calls give the same bytes; otherwise a thread of this process ticks the servo.
+
+    Args:
+        rig: not connected yet.
+        camera: False leaves its connection to the caller, as a connected one holds a renderer.
     """
     from hal.servo.guard import Guard
     from hal.servo.servo import Servo
@@ -43,7 +47,8 @@ def connect_rig(rig: Rig) -> Iterator[Devices]:
     with ExitStack() as stack:
         servo.connect()
         stack.callback(servo.disconnect)
-        rig.camera.connect()
+        if camera:
+            rig.camera.connect()
         stack.callback(rig.camera.disconnect)
         if rig.call_every_tick is not None:
             rig.call_every_tick(servo.tick)

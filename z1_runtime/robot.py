@@ -203,9 +203,9 @@ class Robot:
         self._executor.execute(motion)
         return self._executor.settle()
 
-    def home(self) -> ArmState:
-        """Move to the observation posture with open jaws (see `move_to`)."""
-        return self.move_to(z1.Q_HOME, jaw=self.config.jaw_home)
+    def home(self, *, jaw: float | None = None) -> ArmState:
+        """Move to the observation posture (see `move_to`); without `jaw` a held object stays held."""
+        return self.move_to(z1.Q_HOME, jaw=jaw)
 
     def stop(self) -> None:
         """Brake, hold, and latch; every command is rejected until `rearm`."""

@@ -55,6 +55,7 @@ def main(config: DoctorConfig) -> int:
     for group in (required, optional):
         for check in group:
             colour = _COLOURS[check.state]
+            # Square brackets in a driver's output are not markup
             table.add_row(check.name, f"[{colour}]{check.state.value}[/]", _escape(check.found), _escape(check.fix))
         table.add_section()
     Console().print(table)

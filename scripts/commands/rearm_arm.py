@@ -33,4 +33,5 @@ def main(config: RearmConfig) -> int:
         arm.rearm()
         status = wait_for_mode(arm.status, ServoMode.HOLDING)
     print(describe(status))
+    # A cause that persists, such as a fault, latches again
     return 1 if status.mode is ServoMode.STOPPED else 0

@@ -93,7 +93,7 @@ def main(config: Config) -> int:
                 ground_truth = _ground_truth(robot, config, stack)
             console.print(f"  {'start':<9} {1e-3 * start.lap_ms():6.2f} s")
             truth = _pick(robot, ground_truth, process, summary)
-    except BaseException as error:
+    except BaseException as error:  # Ctrl-C too leaves a summary
         summary |= {"success": False, "error": str(error) or type(error).__name__}
         raise
     finally:
@@ -128,7 +128,7 @@ def _open_robot(config: Config, process: HalProcess | None, console: Console) ->
     console.print(f"  {'camera':<9} {extrinsics.origin}", soft_wrap=True)
     selector = make_grasp_selector(runtime, extrinsics.T_flange_camera)
     selector.warm_up()
-    if process is not None:
+    if process is not None:  # last: the HAL process starts while the planner loads
         process.wait_ready()
     robot = Robot(
         connect_remote(config.bus, "demo") if process else connect_rig(RIGS.make("sim", scene=scene, lockstep=True)),
@@ -145,7 +145,7 @@ def _open_robot(config: Config, process: HalProcess | None, console: Console) ->
 
 def _runtime_config(config: Config) -> RuntimeConfig:
     runtime = replace(config.runtime_config(), seed=config.scene.seed, object_class=config.scene.object)
-    if config.rig.name != "wire-sim":
+    if config.rig.name != "wire-sim":  # see WIRED_LEAD_S
         return runtime
     lead_s = max(runtime.executor.lead_s, WIRED_LEAD_S)
     return replace(runtime, executor=replace(runtime.executor, lead_s=lead_s))
@@ -169,7 +169,7 @@ def _pick(
         HalError: as `Robot.pick`; for a HAL process that has ended, with its own last message.
     """
     try:
-        result = robot.pick(attempts=1)
+        result = robot.pick(attempts=1)  # the figures are of one attempt, whatever the configuration has
         truth = ground_truth()
         summary |= summarise(robot, result, truth)
     except HalError as error:

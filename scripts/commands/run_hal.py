@@ -63,7 +63,7 @@ class Config:
 
 def main(config: Config) -> int:
     """Serve until a signal or the end of standard input."""
-    logging.basicConfig(level=logging.WARNING, format="hal: %(message)s")
+    logging.basicConfig(level=logging.WARNING, format="hal: %(message)s")  # libraries: warnings only
     for package in ("hal", "sim_twin"):
         logging.getLogger(package).setLevel(logging.INFO)
     if config.options_from_stdin:
@@ -106,7 +106,7 @@ def make_rig(config: Config) -> Rig:
     name = config.rig.name
     arm = replace(config.arm, mode=Z1Mode.OBSERVE) if config.readonly else config.arm
     if name not in TWINS:
-        return RIGS.make(name, arm=arm)
+        return RIGS.make(name, arm=arm)  # the twin is not imported
     from calibration.board.board import Board
     from scripts.support.calibration_robot import RobotOptions, make_print
 

@@ -43,6 +43,7 @@ def to_lines(values: Mapping[str, Any], given: Mapping[str, Any], source: str, d
             yield f"{indent}{key}:"
             yield from to_lines(value, given.get(key) or {}, source, depth + 1)
         else:
+            # One line for each value, however long; "..." is YAML's end of a lone scalar
             text = yaml.safe_dump(_plain(value), default_flow_style=True, width=10_000).removesuffix("...\n").strip()
             yield f"{indent}{key}: {text}  # {source if key in given else 'default'}"
 

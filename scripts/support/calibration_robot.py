@@ -87,7 +87,7 @@ def _remote_ground_truth(bus: BusConfig, stack: ExitStack) -> Callable[[], Groun
     from sim_twin.ground_truth import GroundTruthClient
 
     client = stack.enter_context(GroundTruthClient(bus))
-    try:
+    try:  # a real robot has no such service, and a twin may have another scene
         return client.truth if client.truth().T_base_board is not None else None
     except HalTimeoutError:
         return None

@@ -97,7 +97,7 @@ def check_processors() -> Check:
 
 def check_memory() -> Check:
     total_gb = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9
-    if total_gb < 3.5:  # a machine sold as 4 GB
+    if total_gb < 3.5:  # a machine of 4 GB reports less than 4
         return Check("memory", State.WARN, f"{total_gb:.1f} GB", "4 GB or more are recommended")
     return Check("memory", State.OK, f"{total_gb:.1f} GB")
 
@@ -112,7 +112,7 @@ def check_shared_memory() -> Check:
 
 def check_disk() -> Check:
     free_gb = shutil.disk_usage(ROOT).free / 1e9
-    if free_gb < 0.2:
+    if free_gb < 0.2:  # ten runs
         return Check("disk", State.MISSING, f"{free_gb:.2f} GB free", "free disk space: a run writes about 20 MB")
     return Check("disk", State.OK, f"{free_gb:.0f} GB free")
 
@@ -206,7 +206,7 @@ def _detector_ms(runtime: str) -> float:
     from models.detector.detector import YoloConfig, YoloModel
 
     detector, image = YoloModel(YoloConfig(runtime=runtime)), np.full((480, 640, 3), 127, np.uint8)
-    watch, times = Stopwatch(), []
+    watch, times = Stopwatch(), []  # the median leaves out the first runs, which load and compile
     for _ in range(9):
         watch.lap_ms()
         detector.detect(image)
@@ -218,6 +218,7 @@ def check_real_time() -> Check:
     import resource
 
     _, highest = resource.getrlimit(resource.RLIMIT_RTPRIO)
+    # 80 is the servo thread's SCHED_FIFO priority
     if highest == resource.RLIM_INFINITY or highest >= 80 or os.geteuid() == 0:
         return Check("real-time rights", State.OK, "root" if os.geteuid() == 0 else f"priority up to {highest}")
     fix = _limits_fix("rtprio 90")
@@ -254,7 +255,7 @@ def check_camera() -> Check:
 def check_arm() -> Check:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
-            probe.connect((ARM_ADDRESS, 9))  # a UDP connect sends nothing; it only looks up the route
+            probe.connect((ARM_ADDRESS, 9))  # a UDP connect sends nothing, and finds the route; port 9 is discard
             ours = probe.getsockname()[0]
         except OSError:
             ours = "no route"

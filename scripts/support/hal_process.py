@@ -68,7 +68,7 @@ class HalProcess:
         """Let the HAL brake and exit; one that is still starting is terminated."""
         assert self._process.stdin is not None
         self._process.stdin.close()
-        if not self._ready:
+        if not self._ready:  # nothing to brake yet, and standard input is not watched yet
             self._process.terminate()
         try:
             self._process.wait(timeout=_SHUTDOWN_S)

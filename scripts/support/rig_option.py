@@ -31,5 +31,6 @@ class RigOption:
     @property
     def name(self) -> str:
         """The rig's name, as in `hal.rig.RIGS`."""
+        # The mutex group allows one of them; field names have no hyphen
         selected = [name for name in ("sim", "wire_sim", "mock", "real") if getattr(self, name)]
         return selected[0].replace("_", "-") if selected else self.hal

@@ -43,6 +43,6 @@ class SceneOptions(MountErrorOptions):
         Raises:
             InvalidValueError: an option is out of its range.
         """
-        from sim_twin.model.scene import SceneConfig
+        from sim_twin.model.scene import SceneConfig  # `./z1 hal --real` must not load the twin
 
         return SceneConfig(**asdict(self), board=board)

@@ -84,7 +84,7 @@ def draw_geoms(model: mujoco.MjModel) -> Drawing:
 
 def _shape(model: mujoco.MjModel, geom: int) -> Any:
     size, kind = model.geom_size[geom], mujoco.mjtGeom(model.geom_type[geom])
-    material = int(model.geom_matid[geom])
+    material = int(model.geom_matid[geom])  # -1: the geom has its own colour
     rgba = model.mat_rgba[material] if material >= 0 else model.geom_rgba[geom]
     colour = [(255 * rgba).astype(np.uint8)]
     solid = rr.components.FillMode.Solid

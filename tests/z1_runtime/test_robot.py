@@ -70,9 +70,10 @@ def test_move_to_a_pose_puts_the_pivot_there(robot: Robot) -> None:
     assert state.q[-1] == pytest.approx(-0.5, abs=1e-3)
 
 
-def test_home_is_the_observation_posture_with_open_jaws(robot: Robot) -> None:
+def test_home_is_the_observation_posture_and_keeps_the_jaw(robot: Robot) -> None:
     robot.move_to(z1.Q_HOME + 0.1, jaw=-0.2)
-    np.testing.assert_allclose(robot.home().q, np.append(z1.Q_HOME, robot.config.jaw_home), atol=1e-3)
+    np.testing.assert_allclose(robot.home().q, np.append(z1.Q_HOME, -0.2), atol=1e-3)
+    np.testing.assert_allclose(robot.home(jaw=-1.0).q, np.append(z1.Q_HOME, -1.0), atol=1e-3)
 
 
 def unreachable_pose() -> np.ndarray:

@@ -19,10 +19,10 @@ from z1_runtime.visualization.robot_view import Drawing, RobotView
 
 _JPEG_QUALITY = 80
 _DEPTH_STEPS_PER_M = 1000.0  # 1 mm is finer than a screen shows, and compresses far better than 0.1 mm of noise
-_SCENE_POINTS = 30_000
-_PATH_POINTS = 200
+_SCENE_POINTS = 30_000  # a tenth of a frame's 307 200 pixels
+_PATH_POINTS = 200  # per motion, which has 500 samples a second
 _FINGER_M = 0.04
-_DEFAULT_WIDTH_M = 0.06
+_DEFAULT_WIDTH_M = 0.06  # drawn where the generator gives no width
 _OBJECT_COLOUR = (255, 140, 0)
 _CHOSEN_COLOUR = (0, 220, 90)
 
@@ -37,7 +37,7 @@ def draw_frame(frame: RgbdFrame, T_base_camera: np.ndarray) -> Drawing:
             image_from_camera=k.K,
             resolution=[k.width, k.height],
             camera_xyz=rr.ViewCoordinates.RDF,
-            image_plane_distance=0.08,
+            image_plane_distance=0.08,  # length of the drawn frustum [m]
         ),
     )
     _, jpeg = cv2.imencode(".jpg", frame.colour[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
@@ -53,7 +53,9 @@ def draw_frame(frame: RgbdFrame, T_base_camera: np.ndarray) -> Drawing:
 def draw_observation(observation: Observation) -> Drawing:
     """Both clouds in base, and the detection."""
     T, frame = observation.T_base_camera, observation.frame
-    scene = observation.scene_points[:: max(1, -(-len(observation.scene_points) // _SCENE_POINTS))]
+    scene = observation.scene_points[
+        :: max(1, -(-len(observation.scene_points) // _SCENE_POINTS))
+    ]  # the negations round up
     yield (
         blueprint.SCENE,
         rr.Points3D(_to_base(scene, T), colors=_colours_at(scene, frame.colour, frame.intrinsics), radii=0.001),
@@ -79,7 +81,7 @@ def draw_box(box: OrientedBox | None, faces: np.ndarray, T_base_camera: np.ndarr
     offsets, plates = np.zeros((len(axes), 3)), np.tile(half, (len(axes), 1))
     rows = np.arange(len(axes))
     offsets[rows, axes] = signs * half[axes]
-    plates[rows, axes] = 2e-4
+    plates[rows, axes] = 2e-4  # a face is a box of almost no thickness
     yield blueprint.BOX_FACES, _boxes(T_base_box, offsets, plates, (90, 160, 255, 90), fill="solid")
     yield (
         f"{blueprint.BOX_FACES}/normals",
@@ -172,7 +174,7 @@ def _to_base(points: np.ndarray, T_base_camera: np.ndarray) -> np.ndarray:
 
 def _colours_at(points: np.ndarray, colour: np.ndarray, k: Intrinsics) -> np.ndarray:
     """Return the image's colour (N, 3) at the pixels of `points` (N, 3), which are in the camera frame."""
-    z = np.maximum(points[:, 2], 1e-6)
+    z = np.maximum(points[:, 2], 1e-6)  # a point at the camera centre has no pixel
     u = np.clip(np.round(k.fx * points[:, 0] / z + k.cx), 0, k.width - 1).astype(int)
     v = np.clip(np.round(k.fy * points[:, 1] / z + k.cy), 0, k.height - 1).astype(int)
     return colour[v, u]

@@ -50,7 +50,7 @@ def make_blueprint() -> rrb.Blueprint:
     side = rrb.Vertical(images, plots, lanes, texts, row_shares=[3, 3, 2, 2])
     return rrb.Blueprint(
         rrb.Horizontal(scene, side, column_shares=[3, 2]),
-        rrb.TimePanel(state="collapsed", timeline=TIMELINE),
+        rrb.TimePanel(state="collapsed", timeline=TIMELINE),  # the panels leave the space to the scene
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
     )

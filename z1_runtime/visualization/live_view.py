@@ -55,7 +55,7 @@ class LiveView:
 
     def __exit__(self, *_: object) -> None:
         self._closing.set()
-        self._thread.join()
+        self._thread.join()  # before the devices disconnect
 
     def _run(self) -> None:
         while not self._closing.wait(self._period_s):

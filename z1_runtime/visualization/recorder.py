@@ -95,6 +95,7 @@ class Recorder:
 def _check_free(port: int) -> None:
     # Rerun's server only logs that its port is taken, and then shows nothing.
     with socket.socket() as probe:
+        # Connections of an ended view, in TIME_WAIT, must not count as a listener.
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             probe.bind((LOOPBACK, port))

@@ -140,7 +140,7 @@ class RerunLogger:
             logger.info("the recording dropped %d frames and lost %d entries", self.frames_dropped, self.lost)
 
     def _is_due(self, lane: str, stamp_s: float, gap_s: float) -> bool:
-        if stamp_s - self._last_s[lane] < gap_s * (1.0 - 1e-6):
+        if stamp_s - self._last_s[lane] < gap_s * (1.0 - 1e-6):  # rounding of stamps at exactly the rate
             return False
         self._last_s[lane] = stamp_s
         return True
@@ -171,5 +171,5 @@ class RerunLogger:
     def _next_job(self) -> _Job | None:
         with self._wake:
             self._wake.wait_for(lambda: self._jobs or self._frames or self._closing)
-            lane = self._jobs or self._frames
+            lane = self._jobs or self._frames  # frames last, so that under load they are the ones dropped
             return lane.popleft() if lane else None

@@ -56,10 +56,12 @@ class RobotView:
 def _load_mesh(link: str) -> rr.Mesh3D:
     """Return a link's collision mesh, the STL twin of its visual one, with the vertices of one grid cell merged."""
     mesh = trimesh.load_mesh(z1.mesh_dir() / "collision" / f"z1_{link[0].upper()}{link[1:]}.STL")
+    # merge_vertices rounds to decimal digits, so the grid is made the unit of length
     mesh.apply_scale(1.0 / _MESH_GRID_M)
     mesh.merge_vertices(digits_vertex=0)
     mesh.apply_scale(_MESH_GRID_M)
     a, b, c = mesh.faces.T
+    # A triangle with two corners in one cell has no area left
     mesh.update_faces((a != b) & (b != c) & (c != a))
     return rr.Mesh3D(
         vertex_positions=mesh.vertices.astype(np.float32),

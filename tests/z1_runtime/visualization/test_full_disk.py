@@ -60,6 +60,7 @@ def test_a_disk_that_fills_up_ends_the_recording_and_not_the_pick(
 @pytest.mark.faults
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="Linux has a disk that is always full")
 def test_a_disk_that_is_full_at_the_start_is_one_clear_error(faults_table: FaultsTable) -> None:
-    with pytest.raises(OSError, match=r"/dev/full cannot be written.*No space left on device") as caught:
+    with pytest.raises(OSError) as caught:
         RerunLogger(Path("/dev/full"))
+    assert "/dev/full" in str(caught.value) and "No space left on device" in str(caught.value)
     faults_table.add("disk full before recording", arm="does not move", reads=caught.value)
