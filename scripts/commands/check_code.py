@@ -26,7 +26,7 @@ def main(config: CheckConfig) -> int:
     lint = ["ruff", "check", *(["--fix"] if config.fix else [])]
     layout = ["ruff", "format", *([] if config.fix else ["--check"])]
     types = ["pyright", "--level", "error"]  # its warnings concern modules without stubs
-    vocabulary = ["scripts.commands.check_language"]
+    vocabulary = ["scripts.support.check_language"]
     failed = [step for step in (lint, layout, types, vocabulary) if not _passes(step)]
     for step in failed:
         print(f"error: `{' '.join(step)}` reports findings; see above.", file=sys.stderr)

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from scripts.commands import check_language
-from scripts.commands.check_language import BANNED, Finding, check_files, check_text, replacement
+from scripts.support import check_language
+from scripts.support.check_language import BANNED, Finding, check_files, check_text, replacement
 
 WORDS = [word for pattern in BANNED if pattern.replace("|", "").isalpha() for word in pattern.split("|")]
 PLANTED = WORDS[0]

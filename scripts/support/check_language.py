@@ -43,7 +43,7 @@ BANNED: dict[str, str] = {
 }
 """Pattern of banned words to the terms that replace them (glossary, rule 7 and its unambiguous "never" terms)."""
 
-EXCLUDED = ("LICENSE", "uv.lock", "docs/glossary.md", "scripts/commands/check_language.py")
+EXCLUDED = ("LICENSE", "uv.lock", "docs/glossary.md", "scripts/support/check_language.py")
 """Paths that must hold banned words: licence texts, package names, and the lists of the words themselves."""
 
 # Underscores separate words too, so that identifiers are checked; camelCase names of the URDF, such as its
