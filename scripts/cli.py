@@ -1,4 +1,4 @@
-"""`./z1 COMMAND`: finds the command, hands it its arguments, and turns expected errors into one line."""
+"""`./z1 COMMAND`: dispatch to the command's module, with expected errors as one line."""
 
 from __future__ import annotations
 
@@ -12,41 +12,47 @@ from importlib.metadata import version
 from hal.base.errors import UsageError, Z1Error
 
 COMMANDS = {
-    "demo": ("scripts.commands.run_demo", "the twin sees an object and lifts it, end to end"),
-    "run": ("scripts.commands.run_runtime", "see, plan and move, against a HAL that runs already"),
-    "bench": ("scripts.commands.run_benchmark", "the paper's 81 scenarios: success by method, with intervals"),
+    "demo": ("scripts.commands.run_demo", "pick an object with the twin, end to end"),
+    "run": ("scripts.commands.run_runtime", "pick an object with a running HAL"),
+    "bench": ("scripts.commands.run_benchmark", "run the paper's 81 scenarios: success by method, with intervals"),
     "tune": (
         "scripts.commands.run_tune",
-        "fit the ranking to logged episodes; keep what is set by hand unless that loses",
+        "fit the ranking to logged episodes, against the manual values",
     ),
     "oracle": (
         "scripts.commands.find_reachable_grasps",
-        "which of the scenarios can be solved at all, by search on the truth",
+        "search each scenario for a feasible grasp, on the ground truth",
     ),
-    "hal": ("scripts.commands.run_hal", "serve the arm and the camera, with the servo loop and its limits"),
+    "hal": ("scripts.commands.run_hal", "serve the arm and the camera, with servo loop, limits and watchdog"),
     "calibrate": (
         "scripts.calibrate.calibrate",
-        "the wrist camera, with a printed board: hand-eye, intrinsics, touch test",
+        "calibrate the wrist camera with a printed board: hand-eye, intrinsics, touch test",
     ),
     "twin": (
         "scripts.commands.run_twin",
-        "the twin in place of a device: run-script for pyrealsense2, wire for a Z1's clients",
+        "use the twin in place of a device: run-script for pyrealsense2, wire for a Z1's clients",
     ),
-    "stop": ("scripts.commands.stop_arm", "stop the arm now; it stays stopped until re-armed"),
-    "rearm": ("scripts.commands.rearm_arm", "lift the stop, after somebody has looked at the arm"),
-    "doctor": ("scripts.commands.doctor", "what of this machine is ready, and how to fix the rest"),
-    "show-config": ("scripts.commands.show_config", "every setting in force and where it came from"),
+    "stop": ("scripts.commands.stop_arm", "stop the arm now; the stop latches until rearm"),
+    "rearm": ("scripts.commands.rearm_arm", "lift the latched stop, after inspecting the arm"),
+    "doctor": ("scripts.commands.doctor", "check this machine, and show the fix of each failed check"),
+    "show-config": ("scripts.commands.show_config", "print every setting in force and its origin"),
+    "docs": ("scripts.commands.serve_docs", "serve the documentation"),
     "test": ("scripts.commands.run_tests", "run the tests; pytest's options may follow"),
-    "check": ("scripts.commands.check_code", "lint, format and types, as CI does it"),
+    "check": ("scripts.commands.check_code", "lint, format, types and vocabulary, as in CI"),
 }
-"""Name to (module, help). A module holds `main(config) -> int` and, as `Config`, the dataclass of its options; one
+"""Name to (module, help). A module holds `main(config) -> int` and, as `Config`, the dataclass of its options; a module
 without `Config` takes the bare arguments: `main(list[str]) -> int`."""
 
-FAILED, BAD_USAGE, INTERRUPTED = 1, 2, 130
+FAILED = 1
+"""Exit code of a command that failed: the arm did not follow, the object was not lifted, a check found a defect."""
+BAD_USAGE = 2
+"""Exit code of an input that cannot be used: an option, a configuration file, an output that exists (`UsageError`)."""
+INTERRUPTED = 130
+"""Exit code after Ctrl-C, as shells have it: 128 + SIGINT."""
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run one command and return its exit code: 0 done, 1 failed, 2 bad usage or configuration, 130 interrupted."""
+    """Run one command and return its exit code: 0, `FAILED`, `BAD_USAGE` or `INTERRUPTED`."""
     name, *rest = (sys.argv[1:] if argv is None else argv) or [""]
     if name in ("", "-h", "--help", "help"):
         print(_usage())
@@ -66,11 +72,11 @@ def _run_guarded(name: str, arguments: list[str]) -> int:
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return INTERRUPTED
-    except BrokenPipeError:  # `./z1 doctor | head`: the reader has gone, which is no error
+    except BrokenPipeError:  # `./z1 doctor | head` closes its end, which is no error
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return FAILED
     except Exception as error:
-        expected = isinstance(error, Z1Error | OSError)  # ours, or the file system's; anything else is a defect
+        expected = isinstance(error, Z1Error | OSError)  # the project's or the file system's; others are defects
         if os.environ.get("Z1_DEBUG") == "1" or not expected:
             traceback.print_exc()
         else:
@@ -99,7 +105,7 @@ def _usage() -> str:
     lines = "\n".join(f"  {name:<{width}}  {help_}" for name, (_, help_) in COMMANDS.items())
     return f"""usage: ./z1 COMMAND [options]
 
-A Unitree Z1 with a wrist camera grasps what it sees; without an arm, its digital twin does.
+Grasping with a Unitree Z1 and a wrist camera, or with their digital twin.
 
 {lines}
 

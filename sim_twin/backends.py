@@ -13,6 +13,7 @@ import threading
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -226,14 +227,15 @@ def give_way() -> None:
         os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 10)
 
 
-def make_rig(scene: SceneConfig | None = None, lockstep: bool = False) -> Rig:
+def make_rig(scene: SceneConfig | None = None, lockstep: bool = False, **fields: Any) -> Rig:
     """Return arm, camera and clock of one new world, not yet connected.
 
     Args:
-        scene: what stands on the table; the default scene if None.
+        scene: what stands on the table; None builds it from `fields`.
         lockstep: True for the twin's own clock, False for the wall's.
+        **fields: of a `SceneConfig`, for callers that do not import the twin.
     """
-    world = World(scene if scene is not None else SceneConfig())
+    world = World(scene if scene is not None else SceneConfig(**fields))
     twin_clock = TwinClock(world)
     clock: Clock = twin_clock if lockstep else WallClock()
     return Rig(

@@ -8,11 +8,11 @@ from hypothesis import settings
 
 pytest_plugins = ["tests.support.faults_table"]
 
-# The suite tries the same examples every time, so that a red run is red again; to look for new ones:
+# The same examples in every run, so that a failure is reproducible; to search for new ones:
 # HYPOTHESIS_PROFILE=explore ./z1 test
 settings.register_profile("ci", derandomize=True, deadline=None, database=None)
 settings.register_profile("explore", deadline=None)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci"))
 
-# No test is to find what somebody has calibrated on this machine.
+# Calibration results of this machine must not change a test.
 os.environ["Z1_CALIBRATIONS"] = "/nonexistent/calibrations"

@@ -1,4 +1,4 @@
-"""`./z1 check`: lint, format and types, the same commands as in CI."""
+"""`./z1 check`: lint, format, types and vocabulary, the same commands as in CI."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ ROOT = Path(__file__).resolve().parents[2]
 
 @dataclass(frozen=True, kw_only=True)
 class CheckConfig:
-    """What to do about findings."""
+    """Handling of findings."""
 
     fix: bool = False
-    """Repair what ruff can repair, and format."""
+    """Apply ruff's repairs and its format."""
 
 
 Config = CheckConfig
@@ -25,10 +25,11 @@ def main(config: CheckConfig) -> int:
     """Run all checks, even after one failed; return 1 if any did."""
     lint = ["ruff", "check", *(["--fix"] if config.fix else [])]
     layout = ["ruff", "format", *([] if config.fix else ["--check"])]
-    types = ["pyright", "--level", "error"]  # warnings tell of modules without stubs
-    failed = [step for step in (lint, layout, types) if not _passes(step)]
+    types = ["pyright", "--level", "error"]  # its warnings concern modules without stubs
+    vocabulary = ["scripts.support.check_language"]
+    failed = [step for step in (lint, layout, types, vocabulary) if not _passes(step)]
     for step in failed:
-        print(f"error: `{' '.join(step)}` found something; see above.", file=sys.stderr)
+        print(f"error: `{' '.join(step)}` reports findings; see above.", file=sys.stderr)
     return 1 if failed else 0
 
 

@@ -1,4 +1,4 @@
-"""`./z1 doctor`: what of this machine is ready, and what to type for the rest."""
+"""`./z1 doctor`: checks of this machine, with the command that fixes each failed one."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from scripts.support.doctor_checks import Check, State
 
 @dataclass(frozen=True, kw_only=True)
 class DoctorConfig:
-    """Nothing to choose: every check runs."""
+    """No options: every check runs."""
 
 
 Config = DoctorConfig
 
-NEEDED: Sequence[Callable[[], Check]] = (
+REQUIRED: Sequence[Callable[[], Check]] = (
     checks.check_python,
     checks.check_packages,
     checks.check_usb_library,
@@ -27,7 +27,7 @@ NEEDED: Sequence[Callable[[], Check]] = (
     checks.check_bus_port,
 )
 """Without these the demo cannot run."""
-WELCOME: Sequence[Callable[[], Check]] = (
+OPTIONAL: Sequence[Callable[[], Check]] = (
     checks.check_graphics,
     checks.check_gpu,
     checks.check_detector,
@@ -37,7 +37,7 @@ WELCOME: Sequence[Callable[[], Check]] = (
     checks.check_camera,
     checks.check_arm,
 )
-"""These make it better, or belong to the real robot."""
+"""These improve the demo, or concern the real robot."""
 
 _COLOURS = {State.OK: "green", State.WARN: "yellow", State.MISSING: "red"}
 
@@ -47,31 +47,32 @@ def main(config: DoctorConfig) -> int:
     from rich.console import Console
     from rich.table import Table
 
-    needed, welcome = run_checks(NEEDED), run_checks(WELCOME)
+    required, optional = run_checks(REQUIRED), run_checks(OPTIONAL)
     table = Table(title="This machine")
-    table.add_column("what", no_wrap=True)
-    for column in ("state", "seen", "fix"):
+    table.add_column("check", no_wrap=True)
+    for column in ("state", "found", "fix"):
         table.add_column(column, overflow="fold")
-    for group in (needed, welcome):
+    for group in (required, optional):
         for check in group:
             colour = _COLOURS[check.state]
-            table.add_row(check.name, f"[{colour}]{check.state.value}[/]", _escape(check.seen), _escape(check.fix))
+            # Square brackets in a driver's output are not markup
+            table.add_row(check.name, f"[{colour}]{check.state.value}[/]", _escape(check.found), _escape(check.fix))
         table.add_section()
     Console().print(table)
-    lacking = [check.name for check in needed if check.state is State.MISSING]
-    print(f"the demo cannot run yet: see {', '.join(lacking)}" if lacking else "ready: ./z1 demo")
-    return 1 if lacking else 0
+    missing = [check.name for check in required if check.state is State.MISSING]
+    print(f"the demo cannot run yet: see {', '.join(missing)}" if missing else "ready: ./z1 demo")
+    return 1 if missing else 0
 
 
 def run_checks(functions: Sequence[Callable[[], Check]]) -> list[Check]:
-    """Run each check; one that fails itself becomes a row that says so."""
+    """Run each check; one that raises becomes a row with its error."""
     return [_run(function) for function in functions]
 
 
 def _run(function: Callable[[], Check]) -> Check:
     try:
         return function()
-    except Exception as error:  # one broken check must not hide the others
+    except Exception as error:  # one broken check must not stop the others
         name = function.__name__.removeprefix("check_").replace("_", " ")
         return Check(name, State.MISSING, f"the check itself failed: {type(error).__name__}: {error}", "report this")
 

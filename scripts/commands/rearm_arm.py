@@ -1,4 +1,4 @@
-"""`./z1 rearm`: lift the stop, after somebody has looked at the arm. It holds where it is."""
+"""`./z1 rearm`: lift the latched stop, after inspecting the arm. It holds its position."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from scripts.commands.stop_arm import describe, wait_for_mode
 
 @dataclass(frozen=True, kw_only=True)
 class RearmConfig:
-    """Which arm."""
+    """Address of the HAL."""
 
     bus: Annotated[BusConfig, tyro.conf.arg(name="")] = field(default_factory=BusConfig)
 
@@ -24,7 +24,7 @@ Config = RearmConfig
 
 
 def main(config: RearmConfig) -> int:
-    """Re-arm and print what the servo says; return 1 if the stop was latched again at once.
+    """Rearm and print the servo's status; return 1 if the stop was latched again at once.
 
     Raises:
         HalTimeoutError: no HAL process answers.
@@ -33,4 +33,5 @@ def main(config: RearmConfig) -> int:
         arm.rearm()
         status = wait_for_mode(arm.status, ServoMode.HOLDING)
     print(describe(status))
+    # A cause that persists, such as a fault, latches again
     return 1 if status.mode is ServoMode.STOPPED else 0

@@ -1,4 +1,4 @@
-"""The twin sees an object with its wrist camera and lifts it: HAL and runtime as two processes over Zenoh.
+"""Pick of an object by the twin, from its wrist camera's frame to the lift: HAL and runtime as two processes.
 
 ./z1 demo
 ./z1 demo --object box --distance-m 0.44 --lateral-m 0.1 --seed 3 --view
@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import json
 import logging
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 from rich.console import Console
@@ -23,105 +25,75 @@ from hal.base.messages import ServoStatus
 from hal.bus.session import BusConfig
 from scripts.commands.run_hal import TWINS
 from scripts.support.hal_process import HalProcess
+from scripts.support.pick_options import PickOptions, print_phase
 from scripts.support.rig_option import RigOption
-from sim_twin.model.scene import SceneConfig
+from scripts.support.scene_options import SceneOptions
 
-if TYPE_CHECKING:  # planner and viewer take seconds to load: that happens beside the HAL's own start
-    from scripts.support.demo_robot import DemoRobot
+if TYPE_CHECKING:  # planner and viewer take seconds to load, which the HAL's own start overlaps
     from sim_twin.ground_truth import GroundTruth
-    from z1_runtime.tasks.pick import Phase, PickResult, PickTask
+    from z1_runtime.config import RuntimeConfig
+    from z1_runtime.robot import Robot
+    from z1_runtime.tasks.pick import PickResult
 
 WIRED_LEAD_S = 0.5
-"""How much motion waits at the servo when the twin lives in processes of its own [s]; its watchdogs are the same."""
+"""Motion queued at the servo when the twin runs in its own processes [s]; they delay a chunk by up to 0.1 s on one
+core. The watchdogs stay the same."""
 LIFTED_M = 0.05
-"""An object at least this much higher than before counts as lifted [m]."""
+"""Rise of the object that counts as lifted [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config:
-    """What stands where, and what is written."""
+class Config(PickOptions):
+    """Scene, pick and output."""
 
     rig: Annotated[RigOption, tyro.conf.arg(name="")] = field(default_factory=RigOption)
-    """Which hardware; a demo is of the twin's."""
-    object: str = "bottle"
-    """bottle, box or cylinder."""
-    pitch_deg: float = 0.0
-    """Lean of the object about the base's y axis [°]; a leaning one is held by a break-away fixture."""
-    distance_m: float = 0.48
-    """How far in front of the base it stands [m]."""
-    lateral_m: float = 0.0
-    """How far to the left [m]."""
-    seed: int = 0
-    """Of the camera's noise and of the grasp generator."""
+    """Selection of the twin."""
+    scene: Annotated[SceneOptions, tyro.conf.arg(name="")] = field(default_factory=SceneOptions)
+    """The scene."""
     out: Path = Path("out/demo")
     """Folder for summary.json, episode.rrd, grasp.png, config.yaml and hal.log."""
-    view: bool = False
-    """Show everything live in Rerun."""
     lockstep: bool = False
     """One process on the twin's own clock: slower to watch, and the same figures for the same seed."""
-    detector: str | None = None
-    """Overrides the configuration: `tabletop`, `yolo`, or `truth` for evaluation."""
-    detector_weights: Path | None = None
-    """Weights for `yolo`, which it then is: .npz of ours, .pt of ultralytics, .onnx, or OpenVINO's .xml or folder."""
-    crop: Literal["mask", "box"] | None = None
-    """Overrides the configuration: what is cut out of the depth; `box` is the paper's."""
-    calibration: Path | None = None
-    """A hand-eye result; by default the newest of this camera (see `./z1 calibrate`), else the mount's drawing."""
-    mount_error_m: float = 0.0
-    """How far the twin's camera really sits from where the mount's drawing has it [m]."""
-    mount_error_deg: float = 0.0
-    """How far it is really turned [°]."""
-    mount_seed: int = 0
-    """Of the direction of both."""
-    generator: str | None = None
-    """Overrides the configuration: which grasp generator, such as `diffusion` or `union:obb_sweep+diffusion`."""
-    generator_weights: Path | None = None
-    """Weights for the generator that has such: GraspGen's .yml, GraspGenX's folder, or an .npz for `diffusion`."""
-    config: Path | None = None
-    """A YAML file of settings (see `./z1 show-config`)."""
     bus: Annotated[BusConfig, tyro.conf.arg(name="")] = field(default_factory=BusConfig)
-    """Where the two processes meet."""
+    """Address of the link between the two processes."""
 
     def __post_init__(self) -> None:
         if self.rig.name not in TWINS:
             raise InvalidValueError(
-                f"the demo knows where everything really is, so it is of the twin's: {' or '.join(TWINS)}, not "
-                f"{self.rig.name}. For other hardware: ./z1 hal --hal {self.rig.name}, and beside it ./z1 run."
+                f"demo: the rig has no ground truth ({self.rig.name}, allowed {' or '.join(TWINS)}). "
+                f"For other hardware run ./z1 hal --hal {self.rig.name}, and in another terminal ./z1 run.",
+                code="no_ground_truth",
             )
         if self.lockstep and self.rig.name != "sim":
-            raise InvalidValueError(f"--lockstep has no wire to go through; leave out --{self.rig.name}.")
+            raise InvalidValueError(
+                f"demo: lock-step has no drivers to test ({self.rig.name}, allowed sim). Leave out --{self.rig.name}.",
+                code="lockstep_rig",
+            )
 
 
 def main(config: Config) -> int:
-    """Run one pick; 0 only if the object was lifted."""
+    """Run one pick; return 0 only if the object was lifted."""
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
     console = Console(highlight=False)
     config.out.mkdir(parents=True, exist_ok=True)
-    for name in ("summary.json", "episode.rrd", "grasp.png"):  # a failed run leaves no old success behind
+    for name in ("summary.json", "episode.rrd", "grasp.png"):  # a failed run leaves no old success in place
         (config.out / name).unlink(missing_ok=True)
-    scene = SceneConfig(
-        object=config.object,
-        distance_m=config.distance_m,
-        lateral_m=config.lateral_m,
-        pitch_deg=config.pitch_deg,
-        seed=config.seed,
-        mount_error_m=config.mount_error_m,
-        mount_error_deg=config.mount_error_deg,
-        mount_seed=config.mount_seed,
-    )
-    console.print(f"[bold]{config.object}[/] at {config.distance_m:.2f} m, {config.lateral_m:+.2f} m to the left")
-    summary = _identity(config)
+    scene = config.scene
+    scene.to_scene()  # rejects bad options before any process starts
+    console.print(f"[bold]{scene.object}[/] at {scene.distance_m:.2f} m, {scene.lateral_m:+.2f} m to the left")
+    summary = _identity(scene)
     try:
-        with ExitStack() as undo:
+        with ExitStack() as stack:
             start = Stopwatch()
             with console.status(
                 "starting the twin, loading the planner (some seconds; half a minute the first time, to compile)"
             ):
-                process = None if config.lockstep else _start_hal(config, scene, undo)
-                robot, pipeline = _assemble(config, scene, process, console, undo)
+                process = None if config.lockstep else _start_hal(config, stack)
+                robot = stack.enter_context(_open_robot(config, process, console))
+                ground_truth = _ground_truth(robot, config, stack)
             console.print(f"  {'start':<9} {1e-3 * start.lap_ms():6.2f} s")
-            truth = _pick(robot, pipeline, process, summary)
-    except BaseException as error:
+            truth = _pick(robot, ground_truth, process, summary)
+    except BaseException as error:  # Ctrl-C too leaves a summary
         summary |= {"success": False, "error": str(error) or type(error).__name__}
         raise
     finally:
@@ -129,111 +101,122 @@ def main(config: Config) -> int:
             (config.out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
     from sim_twin.camera.external_view import draw_picture
 
-    (config.out / "grasp.png").write_bytes(draw_picture(scene, truth.qpos))
+    (config.out / "grasp.png").write_bytes(draw_picture(scene.to_scene(), truth.qpos))
     _print_result(console, config, summary)
     return 0 if summary["success"] else 1
 
 
-def _start_hal(config: Config, scene: SceneConfig, undo: ExitStack) -> HalProcess:
-    process = HalProcess(scene, config.bus, config.out / "hal.log", config.rig.name)
-    undo.callback(process.end)
+def _start_hal(config: Config, stack: ExitStack) -> HalProcess:
+    process = HalProcess(config.scene, config.bus, config.out / "hal.log", config.rig.name)
+    stack.callback(process.end)
     return process
 
 
-def _assemble(
-    config: Config, scene: SceneConfig, process: HalProcess | None, console: Console, undo: ExitStack
-) -> tuple[DemoRobot, PickTask]:
-    """Return the robot, claimed, and what will pick with it; `undo` takes them apart again."""
-    from scripts.support.demo_robot import lockstep_robot, remote_robot
-    from z1_runtime.config import load_config, save_config, with_detector, with_generator
+def _open_robot(config: Config, process: HalProcess | None, console: Console) -> Robot:
+    """Return the connected robot, with detector, generator and planner loaded while the HAL process starts."""
+    from hal.rig import RIGS
+    from z1_runtime.config import save_config
+    from z1_runtime.devices import connect_remote, connect_rig
     from z1_runtime.factory import make_grasp_selector
     from z1_runtime.perception.extrinsics import find_extrinsics
-    from z1_runtime.tasks.pick import PickTask
-    from z1_runtime.visualization.live_view import LiveView
-    from z1_runtime.visualization.rerun_logger import RerunLogger
+    from z1_runtime.robot import Robot
 
-    runtime = replace(load_config(config.config), seed=config.seed, object_class=config.object)
-    runtime = with_detector(runtime, config.detector, config.detector_weights, config.crop)
-    runtime = with_generator(runtime, config.generator, config.generator_weights)
-    if config.rig.name == "wire-sim":  # its two more processes make the way of a chunk longer, on one core up to 0.1 s
-        lead_s = max(runtime.executor.lead_s, WIRED_LEAD_S)
-        runtime = replace(runtime, executor=replace(runtime.executor, lead_s=lead_s))
+    runtime = _runtime_config(config)
     save_config(runtime, config.out / "config.yaml")
-    mount = find_extrinsics(scene.camera_serial(), config.calibration)
-    console.print(f"  {'camera':<9} {mount.origin}", soft_wrap=True)
-    decider = make_grasp_selector(runtime, mount.T_flange_camera)
-    decider.warm_up()
-    inspector = RerunLogger(config.out / "episode.rrd", live=config.view)
-    undo.callback(inspector.close)
-    robot = undo.enter_context(remote_robot(process, config.bus) if process else lockstep_robot(scene))
-    robot.arm.claim("demo")  # given back by its disconnecting, which forgives a HAL that is gone
-    if process:
-        undo.enter_context(LiveView(robot.camera, robot.arm, inspector, mount.T_flange_camera))
-
-    def say(phase: Phase) -> None:
-        console.print(f"  {phase.name:<9} {phase.duration_s:6.2f} s")
-
-    pipeline = PickTask(
-        decider=decider,
-        arm=robot.arm,
-        camera=robot.camera,
-        clock=robot.clock,
-        inspector=inspector,
+    scene = config.scene.to_scene()
+    extrinsics = find_extrinsics(scene.camera_serial(), config.calibration)
+    console.print(f"  {'camera':<9} {extrinsics.origin}", soft_wrap=True)
+    selector = make_grasp_selector(runtime, extrinsics.T_flange_camera)
+    selector.warm_up()
+    if process is not None:  # last: the HAL process starts while the planner loads
+        process.wait_ready()
+    robot = Robot(
+        connect_remote(config.bus, "demo") if process else connect_rig(RIGS.make("sim", scene=scene, lockstep=True)),
         config=runtime,
-        on_phase=say,
+        extrinsics=extrinsics,
+        selector=selector,
+        recording=config.out / "episode.rrd",
+        view=config.view,
+        owner="demo",
+        on_phase=partial(print_phase, console),
     )
-    return robot, pipeline
+    return robot
 
 
-def _pick(robot: DemoRobot, pipeline: PickTask, process: HalProcess | None, summary: dict[str, Any]) -> GroundTruth:
-    """Pick once, fill `summary`, and return the truth afterwards.
+def _runtime_config(config: Config) -> RuntimeConfig:
+    runtime = replace(config.runtime_config(), seed=config.scene.seed, object_class=config.scene.object)
+    if config.rig.name != "wire-sim":  # see WIRED_LEAD_S
+        return runtime
+    lead_s = max(runtime.executor.lead_s, WIRED_LEAD_S)
+    return replace(runtime, executor=replace(runtime.executor, lead_s=lead_s))
+
+
+def _ground_truth(robot: Robot, config: Config, stack: ExitStack) -> Callable[[], GroundTruth]:
+    """Return the source of the ground truth, in this process or in the HAL's."""
+    from sim_twin.ground_truth import GroundTruthClient, read_ground_truth
+
+    if robot.devices.world is not None:
+        return partial(read_ground_truth, robot.devices.world)
+    return stack.enter_context(GroundTruthClient(config.bus)).truth
+
+
+def _pick(
+    robot: Robot, ground_truth: Callable[[], GroundTruth], process: HalProcess | None, summary: dict[str, Any]
+) -> GroundTruth:
+    """Pick once, fill `summary`, and return the ground truth afterwards.
 
     Raises:
-        HalError: as `PickTask.pick`; of a HAL process that has ended, its own last words.
+        HalError: as `Robot.pick`; for a HAL process that has ended, with its own last message.
     """
     try:
-        record = pipeline.pick()
-        truth = robot.truth()
-        summary |= summarise(robot, record, truth)
+        result = robot.pick(attempts=1)  # the figures are of one attempt, whatever the configuration has
+        truth = ground_truth()
+        summary |= summarise(robot, result, truth)
     except HalError as error:
-        if process is not None and (ended := process.why_it_ended()):
-            raise HalError(ended) from error
+        if process is not None and (reason := process.exit_reason()):
+            raise HalError(reason, code="hal_process_ended") from error
         raise
     return truth
 
 
-def _identity(config: Config) -> dict[str, Any]:
+def _identity(scene: SceneOptions) -> dict[str, Any]:
     return {
         "version": version("z1-grasp"),
-        "object": config.object,
-        "pitch_deg": config.pitch_deg,
-        "distance_m": config.distance_m,
-        "lateral_m": config.lateral_m,
-        "seed": config.seed,
+        "object": scene.object,
+        "pitch_deg": scene.pitch_deg,
+        "distance_m": scene.distance_m,
+        "lateral_m": scene.lateral_m,
+        "seed": scene.seed,
     }
 
 
-def summarise(robot: DemoRobot, record: PickResult, truth: GroundTruth) -> dict[str, Any]:
-    """Return what summary.json holds of a pick that was executed."""
-    status = robot.arm.status()
-    decision = record.decision
+def summarise(robot: Robot, result: PickResult, truth: GroundTruth) -> dict[str, Any]:
+    """Return the content of summary.json for an executed pick."""
+    decision = result.decision
     return {
         "success": truth.lifted_m >= LIFTED_M,
         "lifted_m": round(truth.lifted_m, 6),
-        "held": record.held,
+        "held": result.held,
         "n_object_points": len(decision.observation.object_points),
         "n_candidates": len(decision.candidates),
         "n_after_mvb": len(decision.ranked.grasps),
         "rank": decision.plan.rank,
-        "rejections": record.rejections,
+        "rejections": result.rejections,
         "width_m": round(decision.plan.width_m, 6),
-        "jaw": round(record.jaw, 6),
-        "jaw_torque_nm": round(record.jaw_torque_nm, 6),
-        "phase_s": {phase.name: round(phase.duration_s, 3) for phase in record.phases},
+        "jaw": round(result.jaw, 6),
+        "jaw_torque_nm": round(result.jaw_torque_nm, 6),
+        "phase_s": {phase.name: round(phase.duration_s, 3) for phase in result.phases},
         "stage_ms": {name: round(ms, 2) for name, ms in decision.stage_ms.items()},
-        "servo": _servo_figures(status),
-        "zenoh": {"frame_ms_p50": round(robot.frame_ms(50), 3), "frame_ms_p99": round(robot.frame_ms(99), 3)},
+        "servo": _servo_figures(robot.arm.status()),
+        "zenoh": {f"frame_ms_p{percent}": round(_frame_ms(robot, percent), 3) for percent in (50, 99)},
     }
+
+
+def _frame_ms(robot: Robot, percent: float) -> float:
+    """Return a percentile of the frame latency over Zenoh [ms]; 0 in lock-step."""
+    from hal.bus.remote_camera import RemoteCamera
+
+    return robot.camera.frame_latency_ms(percent) if isinstance(robot.camera, RemoteCamera) else 0.0
 
 
 def _servo_figures(status: ServoStatus) -> dict[str, float]:
@@ -250,5 +233,5 @@ def _print_result(console: Console, config: Config, summary: dict[str, Any]) -> 
     console.print(f"  frame in, plan out (ms): {stages}", soft_wrap=True)
     verdict = "[bold green]lifted[/]" if summary["success"] else "[bold red]not lifted[/]"
     console.print(
-        f"{verdict}: the {config.object} is {1e3 * summary['lifted_m']:.0f} mm up; see {config.out}/grasp.png"
+        f"{verdict}: the {config.scene.object} is {1e3 * summary['lifted_m']:.0f} mm up; see {config.out}/grasp.png"
     )

@@ -1,4 +1,4 @@
-"""See, plan and pick once, against a HAL process that runs already (`./z1 hal`).
+"""Detect, plan and pick once, with a HAL process that is running (`./z1 hal`).
 
 ./z1 hal --sim              in one terminal
 ./z1 run                    in another
@@ -7,96 +7,52 @@
 from __future__ import annotations
 
 import logging
-from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated
 
 import tyro
 from rich.console import Console
 
-from hal.base.clock import WallClock
-from hal.bus.client import RemoteArm, RemoteCamera
 from hal.bus.session import BusConfig
-
-if TYPE_CHECKING:
-    from z1_runtime.tasks.pick import PickTask
+from scripts.support.pick_options import PickOptions, print_phase
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config:
-    """Where the HAL is and how the pick is done."""
+class Config(PickOptions):
+    """Address of the HAL, pick and output."""
 
-    calibration: Path | None = None
-    """A hand-eye result; by default the newest of this camera (see `./z1 calibrate`), else the mount's drawing."""
     object: str = ""
     """Class to pick, such as bottle, for a detector that knows classes; empty = the configuration's."""
-    detector: str | None = None
-    """Overrides the configuration: `tabletop` or `yolo`."""
-    detector_weights: Path | None = None
-    """Weights for `yolo`, which it then is: .npz of ours, .pt of ultralytics, .onnx, or OpenVINO's .xml or folder."""
-    crop: Literal["mask", "box"] | None = None
-    """Overrides the configuration: what is cut out of the depth; `box` is the paper's."""
-    generator: str | None = None
-    """Overrides the configuration: which grasp generator, such as `diffusion` or `union:obb_sweep+diffusion`."""
-    generator_weights: Path | None = None
-    """Weights for the generator that has such: GraspGen's .yml, GraspGenX's folder, or an .npz for `diffusion`."""
-    config: Path | None = None
-    """A YAML file of settings (see `./z1 show-config`)."""
     out: Path | None = None
     """Folder for episode.rrd."""
-    view: bool = False
-    """Show everything live in Rerun."""
     bus: Annotated[BusConfig, tyro.conf.arg(name="")] = field(default_factory=BusConfig)
-    """Where the HAL process listens."""
+    """Address of the HAL process."""
 
 
 def main(config: Config) -> int:
-    """Run one pick; 0 only if the jaws hold something afterwards."""
+    """Run one pick; return 0 only if the jaws hold an object afterwards."""
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
     console = Console(highlight=False)
-    with ExitStack() as undo:
-        arm = RemoteArm(config.bus, "run")
-        arm.connect()  # first: whoever forgot the HAL need not wait for the planner to load
-        undo.callback(arm.disconnect)
-        camera = RemoteCamera(config.bus)
-        camera.connect()
-        undo.callback(camera.disconnect)
-        with console.status("loading the planner (some seconds)"):
-            pipeline = _assemble(config, arm, camera, console, undo)
-        arm.claim("run")  # given back by disconnecting, which forgives a HAL that is gone
-        record = pipeline.pick_until_held()
-    console.print("the jaws hold something" if record.held else "the jaws are empty")
-    return 0 if record.held else 1
+    from z1_runtime.robot import Robot
 
-
-def _assemble(config: Config, arm: RemoteArm, camera: RemoteCamera, console: Console, undo: ExitStack) -> PickTask:
-    """Return what picks; `undo` ends what it writes."""
-    from z1_runtime.config import load_config, with_detector, with_generator
-    from z1_runtime.factory import make_grasp_selector
-    from z1_runtime.perception.extrinsics import find_extrinsics
-    from z1_runtime.tasks.pick import PickTask
-    from z1_runtime.visualization.live_view import LiveView
-    from z1_runtime.visualization.rerun_logger import RerunLogger
-
-    runtime = with_detector(load_config(config.config), config.detector, config.detector_weights, config.crop)
-    runtime = with_generator(runtime, config.generator, config.generator_weights)
+    runtime = config.runtime_config()
     if config.object:
         runtime = replace(runtime, object_class=config.object)
-    mount = find_extrinsics(camera.wait_for_frame(runtime.frame_timeout_s).serial, config.calibration)
-    console.print(f"  {'camera':<9} {mount.origin}", soft_wrap=True)
-    decider = make_grasp_selector(runtime, mount.T_flange_camera)
-    decider.warm_up()
-    inspector = RerunLogger(config.out / "episode.rrd" if config.out else None, live=config.view)
-    undo.callback(inspector.close)
-    if config.out or config.view:
-        undo.enter_context(LiveView(camera, arm, inspector, mount.T_flange_camera))
-    return PickTask(
-        decider=decider,
-        arm=arm,
-        camera=camera,
-        clock=WallClock(),
-        inspector=inspector,
+    robot = Robot.connect(
+        config.bus,
+        owner="run",
         config=runtime,
-        on_phase=lambda phase: console.print(f"  {phase.name:<9} {phase.duration_s:6.2f} s"),
+        calibration=config.calibration,
+        recording=config.out / "episode.rrd" if config.out else None,
+        view=config.view,
+        on_phase=partial(print_phase, console),
     )
+    with robot:  # connected before the planner loads, so that a missing HAL is reported at once
+        console.print(f"  {'camera':<9} {robot.extrinsics.origin}", soft_wrap=True)
+        with console.status("loading the planner (some seconds)"):
+            robot.warm_up()
+        result = robot.pick()
+    console.print("the jaws hold an object" if result.held else "the jaws are empty")
+    return 0 if result.held else 1

@@ -1,4 +1,4 @@
-"""`./z1 test [pytest options]`: run the tests of this checkout; `-m faults` injects each fault and prints a table."""
+"""`./z1 test [pytest options]`: the tests of this checkout; `-m faults` injects each fault and prints a table."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`./z1 show-config`: every setting in force, as YAML that `--config` takes back, and where each value came from."""
+"""`./z1 show-config`: every setting in force with its origin, as YAML that `--config` accepts."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from z1_runtime.config import load_config
 
 @dataclass(frozen=True, kw_only=True)
 class ShowConfig:
-    """What to show."""
+    """Configuration to show."""
 
     config: Path | None = None
-    """YAML file whose values go over the defaults."""
+    """YAML file whose values override the defaults."""
 
 
 Config = ShowConfig
@@ -36,13 +36,14 @@ def main(config: ShowConfig) -> int:
 
 
 def to_lines(values: Mapping[str, Any], given: Mapping[str, Any], source: str, depth: int = 0) -> Iterator[str]:
-    """Yield `values` as lines of YAML; each says in a comment whether `given`, read from `source`, holds its key."""
+    """Yield `values` as lines of YAML, each with its origin: `source` for the keys in `given`, else the default."""
     indent = "  " * depth
     for key, value in values.items():
         if isinstance(value, Mapping) and value:
             yield f"{indent}{key}:"
             yield from to_lines(value, given.get(key) or {}, source, depth + 1)
         else:
+            # One line for each value, however long; "..." is YAML's end of a lone scalar
             text = yaml.safe_dump(_plain(value), default_flow_style=True, width=10_000).removesuffix("...\n").strip()
             yield f"{indent}{key}: {text}  # {source if key in given else 'default'}"
 

@@ -1,4 +1,4 @@
-"""`./z1 stop`: the arm brakes, holds, and takes no command until `./z1 rearm`."""
+"""`./z1 stop`: the arm brakes, holds, and rejects every command until `./z1 rearm`."""
 
 from __future__ import annotations
 
@@ -19,25 +19,25 @@ from hal.bus.session import BusConfig
 
 @dataclass(frozen=True, kw_only=True)
 class StopConfig:
-    """Which arm, and why."""
+    """Address of the HAL, and the reason."""
 
     reason: str = "./z1 stop"
-    """What the arm's status will say."""
+    """Reason in the arm's status."""
     bus: Annotated[BusConfig, tyro.conf.arg(name="")] = field(default_factory=BusConfig)
 
 
 Config = StopConfig
 
-_BRAKING_S = 2.0
+_BRAKING_S = 2.0  # five times the longest braking, 0.4 s
 
 
 def main(config: StopConfig) -> int:
-    """Stop the arm and print what the servo says.
+    """Stop the arm and print the servo's status.
 
     Raises:
         HalTimeoutError: no HAL process answers.
     """
-    # Not `RemoteArm`: it waits for the arm's first state, and a stop must get through to an arm that sends none.
+    # Not `RemoteArm`, which waits for the arm's first state: a stop must reach an arm that sends none.
     link = BusLink(config.bus, WallClock(), "the arm")
     try:
         link.request(keys.STOP, config.reason.encode(), "stop command")
@@ -46,17 +46,17 @@ def main(config: StopConfig) -> int:
         link.close()
     print(describe(status))
     if status.mode is not ServoMode.STOPPED:
-        print("error: the arm has not come to rest; use the switch on the arm.", file=sys.stderr)
+        print("error: stop: the arm is not at rest. Use the switch on the arm.", file=sys.stderr)
         return 1
-    print("nothing moves until somebody has looked at the arm and typed: ./z1 rearm")
+    print("nothing moves until the operator has inspected the arm and typed: ./z1 rearm")
     return 0
 
 
 def wait_for_mode(read: Callable[[], ServoStatus], mode: ServoMode) -> ServoStatus:
-    """Return the first status that shows `mode`, or the newest one when that takes longer than a braking arm may."""
+    """Return the first status that shows `mode`, or the newest one after the longest braking time."""
     clock = WallClock()
-    give_up_s = clock.now_s() + _BRAKING_S
-    while (status := read()).mode is not mode and clock.now_s() < give_up_s:
+    deadline_s = clock.now_s() + _BRAKING_S
+    while (status := read()).mode is not mode and clock.now_s() < deadline_s:
         clock.sleep_until(clock.now_s() + 0.01)
     return status
 

@@ -26,6 +26,7 @@ from scripts.calibrate.calibrate_hand_eye import solve
 from scripts.calibrate.calibration_samples import DetectedSamples, now, read_samples
 from scripts.commands import run_demo
 from scripts.support.calibration_robot import RobotOptions, make_scene
+from scripts.support.scene_options import SceneOptions
 from sim_twin.backends import make_rig
 from sim_twin.ground_truth import read_ground_truth
 from z1_runtime.calibration_session.board_search import BoardSearch
@@ -256,17 +257,15 @@ def _mounts(config: Config, folder: Path) -> dict[str, Path]:
 
 def _demo(object_: str, lateral_m: float, seed: int, calibration: Path, out: Path) -> bool:
     """Return whether one lock-step demo lifts its object."""
-    options = run_demo.Config(
+    scene = SceneOptions(
         object=object_,
         lateral_m=lateral_m,
         seed=seed,
-        lockstep=True,
-        calibration=calibration,
         mount_error_m=MOUNT_ERROR_M,
         mount_error_deg=MOUNT_ERROR_DEG,
         mount_seed=0,
-        out=out,
     )
+    options = run_demo.Config(scene=scene, lockstep=True, calibration=calibration, out=out)
     try:
         return run_demo.main(options) == 0
     except RuntimeError:  # nothing detected, no plan, or the arm did not follow: not lifted

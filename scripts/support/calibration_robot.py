@@ -1,10 +1,11 @@
-"""The robot that a calibration drives: the twin in this process, or whatever a HAL process serves."""
+"""The robot of a calibration: the twin in this process, or the devices of a HAL process."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
+from functools import partial
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
@@ -12,9 +13,11 @@ import tyro
 from calibration.board.board import Board
 from hal.base.arm import ServoedArm
 from hal.base.camera import Camera
-from hal.base.clock import Clock, WallClock
+from hal.base.clock import Clock
 from hal.base.errors import HalTimeoutError
 from hal.bus.session import BusConfig
+from scripts.support.scene_options import MountErrorOptions
+from z1_runtime.devices import connect_remote, connect_rig
 
 if TYPE_CHECKING:
     from sim_twin.ground_truth import GroundTruth
@@ -22,30 +25,24 @@ if TYPE_CHECKING:
     from sim_twin.model.scene import SceneConfig
 
 PIXELS_PER_SQUARE = 100
-"""Of the twin's print: 0.25 mm on the default board, finer than a pixel of the camera at any distance."""
+"""Resolution of the twin's print: 0.25 mm on the default board, finer than a pixel of the camera at any distance."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class RobotOptions:
-    """Which robot, and for the twin how it is built."""
+class RobotOptions(MountErrorOptions):
+    """Selection of the robot, and the twin's set-up."""
 
-    hal: Literal["sim", "real"] = "sim"
+    devices: Annotated[Literal["sim", "remote", "real"], tyro.conf.arg(aliases=["--hal"])] = "sim"
     """`sim`: the twin with a board on its table, in this process and on its own clock, so that the same seed gives the
-    same figures. `real`: the robot whose HAL runs already (`./z1 hal`)."""
+    same figures. `remote` (also `real`): the devices of the HAL process that is running (`./z1 hal`)."""
     board_x_m: float = 0.42
-    """Twin: middle of the board in front of the base [m]."""
+    """Twin: centre of the board in front of the base [m]."""
     board_y_m: float = 0.0
-    """Twin: the same to the left [m]."""
+    """Twin: centre of the board to the left [m]."""
     board_yaw_deg: float = 0.0
-    """Twin: how the board is turned [°]."""
-    mount_error_m: float = 0.0
-    """Twin: how far the camera really sits from where the mount's drawing has it [m]."""
-    mount_error_deg: float = 0.0
-    """Twin: how far it is really turned [°]."""
-    mount_seed: int = 0
-    """Twin: of the direction of both."""
+    """Twin: rotation of the board about the vertical [°]."""
     bus: Annotated[BusConfig, tyro.conf.arg(name="")] = field(default_factory=BusConfig)
-    """Where the HAL process listens."""
+    """Address of the HAL process."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -56,7 +53,7 @@ class CalibrationRobot:
     camera: Camera
     clock: Clock
     truth: Callable[[], GroundTruth] | None
-    """Where everything really is; None where nobody knows."""
+    """Ground truth of the scene; None for a real robot."""
 
 
 @contextmanager
@@ -64,41 +61,33 @@ def open_robot(options: RobotOptions, board: Board, seed: int) -> Iterator[Calib
     """Yield the robot; its lease is not claimed yet.
 
     Args:
-        options: which.
-        board: what lies on the twin's table.
+        options: selection of the robot.
+        board: on the twin's table.
         seed: of the twin's noise.
 
     Raises:
         HalTimeoutError: no HAL process answers.
         ValueError: the twin cannot be built like that.
     """
-    if options.hal == "sim":
-        from scripts.support.demo_robot import lockstep_robot
+    with ExitStack() as stack:
+        if options.devices == "sim":
+            from sim_twin.backends import make_rig
+            from sim_twin.ground_truth import read_ground_truth
 
-        with lockstep_robot(make_scene(options, board, seed)) as robot:
-            yield CalibrationRobot(arm=robot.arm, camera=robot.camera, clock=robot.clock, truth=robot.truth)
-        return
-    with ExitStack() as undo:
-        yield _served_robot(options.bus, undo)
-
-
-def _served_robot(bus: BusConfig, undo: ExitStack) -> CalibrationRobot:
-    from hal.bus.client import RemoteArm, RemoteCamera
-
-    clock = WallClock()
-    arm = undo.enter_context(RemoteArm(bus, "calibrate", clock))
-    camera = RemoteCamera(bus, clock)
-    camera.connect()
-    undo.callback(camera.disconnect)
-    return CalibrationRobot(arm=arm, camera=camera, clock=clock, truth=_served_truth(bus, undo))
+            devices = stack.enter_context(connect_rig(make_rig(make_scene(options, board, seed), lockstep=True)))
+            truth: Callable[[], GroundTruth] | None = partial(read_ground_truth, devices.world)
+        else:
+            devices = stack.enter_context(connect_remote(options.bus, "calibrate"))
+            truth = _remote_ground_truth(options.bus, stack)
+        yield CalibrationRobot(arm=devices.arm, camera=devices.camera, clock=devices.clock, truth=truth)
 
 
-def _served_truth(bus: BusConfig, undo: ExitStack) -> Callable[[], GroundTruth] | None:
-    """Return the truth if the HAL is a twin's with a board on its table."""
+def _remote_ground_truth(bus: BusConfig, stack: ExitStack) -> Callable[[], GroundTruth] | None:
+    """Return the ground truth if the HAL is a twin's with a board on its table."""
     from sim_twin.ground_truth import GroundTruthClient
 
-    client = undo.enter_context(GroundTruthClient(bus))
-    try:
+    client = stack.enter_context(GroundTruthClient(bus))
+    try:  # a real robot has no such service, and a twin may have another scene
         return client.truth if client.truth().T_base_board is not None else None
     except HalTimeoutError:
         return None
@@ -108,17 +97,12 @@ def make_scene(options: RobotOptions, board: Board, seed: int) -> SceneConfig:
     """Return the twin's scene with `board` on the table."""
     from sim_twin.model.scene import SceneConfig
 
-    return SceneConfig(
-        seed=seed,
-        board=make_print(options, board),
-        mount_error_m=options.mount_error_m,
-        mount_error_deg=options.mount_error_deg,
-        mount_seed=options.mount_seed,
-    )
+    mount = {each.name: getattr(options, each.name) for each in fields(MountErrorOptions)}
+    return SceneConfig(seed=seed, board=make_print(options, board), **mount)
 
 
 def make_print(options: RobotOptions, board: Board) -> BoardSpec:
-    """Return `board` as the twin takes it."""
+    """Return `board` in the twin's form."""
     from sim_twin.model.charuco_board import BoardSpec
 
     return BoardSpec(

@@ -1,4 +1,4 @@
-"""The doctor's questions: each looks at one thing, changes nothing, and never waits long."""
+"""Checks of `./z1 doctor`: each inspects one part of the machine, changes nothing, and has a time limit."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ ROOT = Path(__file__).resolve().parents[2]
 ARM_ADDRESS = "192.168.123.110"
 """The vendor's address of a Z1's board."""
 
-# Without ultralytics, which those who ship this may leave out (see NOTICE).
+# Without ultralytics, which a distributor may leave out (see NOTICE).
 _MODULES = [
     "numpy",
     "scipy",
@@ -47,11 +47,11 @@ _LIMITS_FILE = "/etc/security/limits.d/z1.conf"
 
 
 class State(Enum):
-    """How a check came out."""
+    """Result of a check."""
 
     OK = "ok"
     WARN = "warn"
-    """Works, but worse than it could."""
+    """Works, with a restriction."""
     MISSING = "missing"
 
 
@@ -61,10 +61,10 @@ class Check:
 
     name: str
     state: State
-    seen: str
-    """What was found."""
+    found: str
+    """Finding on this machine."""
     fix: str = ""
-    """What to type or do."""
+    """Command or action that fixes it."""
 
 
 def check_python() -> Check:
@@ -75,9 +75,9 @@ def check_python() -> Check:
 
 
 def check_packages() -> Check:
-    gone = [name for name in _MODULES if find_spec(name) is None]
-    if gone:
-        return Check("packages", State.MISSING, f"not installed: {', '.join(gone)}", "rm -rf .venv; ./z1 --version")
+    missing = [name for name in _MODULES if find_spec(name) is None]
+    if missing:
+        return Check("packages", State.MISSING, f"not installed: {', '.join(missing)}", "rm -rf .venv; ./z1 --version")
     return Check("packages", State.OK, f"all {len(_MODULES)} found")
 
 
@@ -89,16 +89,16 @@ def check_usb_library() -> Check:
 
 def check_processors() -> Check:
     usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    seen = f"{usable} cores, {platform.machine()}"
+    found = f"{usable} cores, {platform.machine()}"
     if usable < 2:
-        return Check("processor", State.WARN, seen, "give it two cores: one belongs to the 500 Hz servo loop")
-    return Check("processor", State.OK, seen)
+        return Check("processor", State.WARN, found, "use a machine with two cores: the 500 Hz servo loop needs one")
+    return Check("processor", State.OK, found)
 
 
 def check_memory() -> Check:
     total_gb = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9
-    if total_gb < 3.5:
-        return Check("memory", State.WARN, f"{total_gb:.1f} GB", "4 GB or more are comfortable")
+    if total_gb < 3.5:  # a machine of 4 GB reports less than 4
+        return Check("memory", State.WARN, f"{total_gb:.1f} GB", "4 GB or more are recommended")
     return Check("memory", State.OK, f"{total_gb:.1f} GB")
 
 
@@ -106,14 +106,14 @@ def check_shared_memory() -> Check:
     free_mb = shutil.disk_usage("/dev/shm").free / 1e6
     fix = "sudo mount -o remount,size=256M /dev/shm (in a container: --shm-size=256m)"
     if free_mb < 64:
-        return Check("shared memory", State.WARN, f"{free_mb:.0f} MB free; images want 64", fix)
+        return Check("shared memory", State.WARN, f"{free_mb:.0f} MB free; images need 64", fix)
     return Check("shared memory", State.OK, f"{free_mb:.0f} MB free")
 
 
 def check_disk() -> Check:
     free_gb = shutil.disk_usage(ROOT).free / 1e9
-    if free_gb < 0.2:
-        return Check("disk", State.MISSING, f"{free_gb:.2f} GB free", "make room: a run writes about 20 MB")
+    if free_gb < 0.2:  # ten runs
+        return Check("disk", State.MISSING, f"{free_gb:.2f} GB free", "free disk space: a run writes about 20 MB")
     return Check("disk", State.OK, f"{free_gb:.0f} GB free")
 
 
@@ -122,21 +122,21 @@ def check_bus_port() -> Check:
 
     config = BusConfig(connect_timeout_s=0.5)
     check = _check_port(
-        "Zenoh port", config.port, f"end the program that holds it, or: ./z1 demo --port {config.port + 1}"
+        "Zenoh port", config.port, f"end the program that uses it, or: ./z1 demo --port {config.port + 1}"
     )
     if check.state is State.OK or not (health := _our_hal(config)):
         return check
-    seen = f"{config.port} is held by our own HAL process (robot {config.robot!r}): {health}"
+    found = f"{config.port} is used by a HAL process of this project (robot {config.robot!r}): {health}"
     return Check(
         "Zenoh port",
         State.WARN,
-        seen,
+        found,
         f"use it with ./z1 run; for the demo end it, or: ./z1 demo --port {config.port + 1}",
     )
 
 
 def _our_hal(config: BusConfig) -> str:
-    """Return how a HAL process of ours does that answers on that port, else nothing."""
+    """Return the health of a HAL process of this project on that port; empty if there is none."""
     from hal.base.clock import WallClock
     from hal.base.errors import HalError
     from hal.bus.health import describe_health, wait_for_health
@@ -156,7 +156,7 @@ def check_graphics() -> Check:
         "from mujoco.egl import GLContext; c = GLContext(64, 64); c.make_current(); from OpenGL import GL; "
         "print(GL.glGetString(GL.GL_RENDERER).decode())"
     )
-    fix = "sudo apt install libegl1 libgl1-mesa-dri (until then the twin's camera casts rays, with flat colours)"
+    fix = "sudo apt install libegl1 libgl1-mesa-dri (until then the twin's camera uses ray casting, with flat colours)"
     code, out = _run_python(program, timeout_s=20.0, MUJOCO_GL="egl", PYOPENGL_PLATFORM="egl")
     if code != 0:
         return Check("graphics", State.WARN, f"no OpenGL through EGL: {_last_line(out)}", fix)
@@ -170,7 +170,7 @@ def check_gpu() -> Check:
     command = ["nvidia-smi", "--query-gpu=name,driver_version", "--format=csv,noheader"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=10, check=False)
     if done.returncode != 0:
-        return Check("GPU", State.WARN, _last_line(done.stdout + done.stderr), "look at the NVIDIA driver; not needed")
+        return Check("GPU", State.WARN, _last_line(done.stdout + done.stderr), "check the NVIDIA driver; not needed")
     return Check("GPU", State.OK, done.stdout.strip().replace("\n", "; "))
 
 
@@ -179,25 +179,25 @@ def check_detector() -> Check:
     from models.detector.weights import detector_path
     from models.weights_file import WeightsError
 
-    able = installed_runtimes()
-    if not able:
+    runtimes = installed_runtimes()
+    if not runtimes:
         return Check(
             "detector", State.WARN, "no runtime", "uv sync --extra fast-detector; until then: --detector tabletop"
         )
     try:
-        ms = {runtime: _detector_ms(runtime) for runtime in able}
+        ms = {runtime: _detector_ms(runtime) for runtime in runtimes}
     except WeightsError as error:
         fix = f"restore models/weights/{detector_path().name}; until then: --detector tabletop"
         return Check("detector", State.WARN, str(error), fix)
-    used, best = able[0], min(ms, key=lambda name: ms[name])
-    seen = ", ".join(f"{name} {ms[name]:.0f} ms" for name in able) + f"; {used} is used"
+    used, best = runtimes[0], min(ms, key=lambda name: ms[name])
+    found = ", ".join(f"{name} {ms[name]:.0f} ms" for name in runtimes) + f"; {used} is used"
     if ms[used] > 1.3 * ms[best]:
-        return Check("detector", State.WARN, seen, f"detector_runtime: {best} in the configuration (--config)")
-    return Check("detector", State.OK, seen)
+        return Check("detector", State.WARN, found, f"detector_runtime: {best} in the configuration (--config)")
+    return Check("detector", State.OK, found)
 
 
 def _detector_ms(runtime: str) -> float:
-    """Return the median time to look at an image of 640 x 480 [ms]."""
+    """Return the median time of a detection in an image of 640 x 480 [ms]."""
     from statistics import median
 
     import numpy as np
@@ -206,7 +206,7 @@ def _detector_ms(runtime: str) -> float:
     from models.detector.detector import YoloConfig, YoloModel
 
     detector, image = YoloModel(YoloConfig(runtime=runtime)), np.full((480, 640, 3), 127, np.uint8)
-    watch, times = Stopwatch(), []
+    watch, times = Stopwatch(), []  # the median leaves out the first runs, which load and compile
     for _ in range(9):
         watch.lap_ms()
         detector.detect(image)
@@ -218,6 +218,7 @@ def check_real_time() -> Check:
     import resource
 
     _, highest = resource.getrlimit(resource.RLIMIT_RTPRIO)
+    # 80 is the servo thread's SCHED_FIFO priority
     if highest == resource.RLIM_INFINITY or highest >= 80 or os.geteuid() == 0:
         return Check("real-time rights", State.OK, "root" if os.geteuid() == 0 else f"priority up to {highest}")
     fix = _limits_fix("rtprio 90")
@@ -230,8 +231,8 @@ def check_locked_memory() -> Check:
     _, highest = resource.getrlimit(resource.RLIMIT_MEMLOCK)
     if highest == resource.RLIM_INFINITY or highest >= 512e6 or os.geteuid() == 0:
         return Check("locked memory", State.OK, "root" if os.geteuid() == 0 else "enough")
-    seen = f"{highest / 1e6:.0f} MB: the servo loop may wait for the disk"
-    return Check("locked memory", State.WARN, seen, _limits_fix("memlock unlimited"))
+    found = f"{highest / 1e6:.0f} MB: the servo loop may wait for the disk"
+    return Check("locked memory", State.WARN, found, _limits_fix("memlock unlimited"))
 
 
 def check_camera() -> Check:
@@ -254,7 +255,7 @@ def check_camera() -> Check:
 def check_arm() -> Check:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
-            probe.connect((ARM_ADDRESS, 9))  # a UDP connect sends nothing; it only looks up the route
+            probe.connect((ARM_ADDRESS, 9))  # a UDP connect sends nothing, and finds the route; port 9 is discard
             ours = probe.getsockname()[0]
         except OSError:
             ours = "no route"
@@ -262,12 +263,12 @@ def check_arm() -> Check:
         fix = "not needed for the twin; sudo ip address add 192.168.123.162/24 dev <the arm's network port>"
         return Check("arm", State.MISSING, f"not configured: this machine has no address near {ARM_ADDRESS}", fix)
     if _is_there(ARM_ADDRESS):
-        return Check("arm", State.OK, f"{ARM_ADDRESS} answers, seen from {ours}")
-    return Check("arm", State.MISSING, f"{ARM_ADDRESS} does not answer", "switch the arm on; look at the cable")
+        return Check("arm", State.OK, f"{ARM_ADDRESS} answers {ours}")
+    return Check("arm", State.MISSING, f"{ARM_ADDRESS} does not answer", "switch the arm on; check the cable")
 
 
 def _is_there(address: str) -> bool:
-    # A closed TCP port is an answer too. The arm's own UDP port is left alone: a datagram there could be a command.
+    # A closed TCP port answers too. The arm's UDP port is not probed: a datagram there could be a command.
     with socket.socket() as probe:
         probe.settimeout(0.5)
         code = probe.connect_ex((address, 9))
@@ -289,7 +290,7 @@ def _check_port(name: str, port: int, fix: str) -> Check:
 
 
 def _run_python(program: str, timeout_s: float, **environment: str) -> tuple[int, str]:
-    """Run `program` in a process of its own, as drivers may hang or end it; return exit code and output."""
+    """Run `program` in a process of its own, as drivers may hang or crash it; return exit code and output."""
     try:
         done = subprocess.run(
             [sys.executable, "-P", "-c", program],

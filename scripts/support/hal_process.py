@@ -2,52 +2,48 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 from hal.base.errors import HalError
 from hal.bus.session import BusConfig
-from sim_twin.model.scene import SceneConfig
+from scripts.support.scene_options import SceneOptions
 
 READY = "ready"
-"""The line that a HAL process prints once everything answers."""
-_BRAKING_S = 10.0
-_DYING_S = 0.5
-"""The link may break before the process is gone."""
+"""Line that a HAL process prints when it accepts requests."""
+_SHUTDOWN_S = 10.0
+_EXIT_S = 0.5  # the link may break before the process has exited
 
 
 class HalProcess:
-    """A HAL process of the twin; it ends with this one, whatever happens to this one.
+    """A HAL process of the twin that ends with this one, also when this one is killed.
 
     Args:
-        scene: what stands on the table.
-        bus: where it listens.
-        log: file for what it says.
-        hal: which rig of the twin's, `sim` or `wire-sim`.
+        scene: objects on the table.
+        bus: address that it listens on.
+        log: file of its log.
+        hal: the twin's rig, `sim` or `wire-sim`.
     """
 
-    def __init__(self, scene: SceneConfig, bus: BusConfig, log: Path, hal: str = "sim") -> None:
-        # What is as it always is stays unsaid: a served scene has fewer options than a benchmark's.
-        changed = {f.name: value for f in fields(scene) if (value := getattr(scene, f.name)) != f.default}
-        options = {**changed, **asdict(bus)}
-        for name in ("noise", "board"):  # a served camera always has its noise; no demo has a board
-            options.pop(name, None)
-        arguments = [_option(name, value) for name, value in options.items()]
+    def __init__(self, scene: SceneOptions, bus: BusConfig, log: Path, hal: str = "sim") -> None:
         self._log, self._ready = log, False
         with log.open("wb") as stderr:
             self._process = subprocess.Popen(
-                [sys.executable, "-P", "-m", "scripts.cli", "hal", f"--hal={hal}", "--until-stdin-closes", *arguments],
+                [sys.executable, "-P", "-m", "scripts.cli", "hal", "--options-from-stdin"],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=stderr,
-                start_new_session=True,  # Ctrl-C is for this process, which then ends that one in order
+                start_new_session=True,  # Ctrl-C reaches this process only, which then ends the child in order
             )
+        assert self._process.stdin is not None
+        self._process.stdin.write(encode_options(hal, scene, bus))
+        self._process.stdin.flush()
 
     def wait_ready(self) -> None:
-        """Return once the HAL answers.
+        """Return when the HAL accepts requests.
 
         Raises:
             HalError: it ended instead; the message is its own.
@@ -55,13 +51,13 @@ class HalProcess:
         assert self._process.stdout is not None
         if self._process.stdout.readline().decode().strip() != READY:
             self._process.wait()
-            raise HalError(self.why_it_ended())
+            raise HalError(self.exit_reason())
         self._ready = True
 
-    def why_it_ended(self) -> str:
-        """Return its own last words, or at least how it ended; empty while it runs."""
+    def exit_reason(self) -> str:
+        """Return its last error, or at least its exit code; empty while it runs."""
         try:
-            code = self._process.wait(timeout=_DYING_S)
+            code = self._process.wait(timeout=_EXIT_S)
         except subprocess.TimeoutExpired:
             return ""
         lines = self._log.read_text(errors="replace").splitlines()
@@ -69,20 +65,24 @@ class HalProcess:
         return errors[-1] if errors else f"the HAL process ended with code {code}; see {self._log}"
 
     def end(self) -> None:
-        """Let the HAL brake and end; one that is still starting has nothing to brake."""
+        """Let the HAL brake and exit; one that is still starting is terminated."""
         assert self._process.stdin is not None
         self._process.stdin.close()
-        if not self._ready:
+        if not self._ready:  # nothing to brake yet, and standard input is not watched yet
             self._process.terminate()
         try:
-            self._process.wait(timeout=_BRAKING_S)
+            self._process.wait(timeout=_SHUTDOWN_S)
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
 
 
-def _option(name: str, value: Any) -> str:
-    option = name.replace("_", "-")
-    if isinstance(value, bool):
-        return f"--{option}" if value else f"--no-{option}"
-    return f"--{option}={value}"
+def encode_options(hal: str, scene: SceneOptions, bus: BusConfig) -> bytes:
+    """Return the options of `./z1 hal --options-from-stdin`: one line of JSON."""
+    return json.dumps({"hal": hal, "scene": asdict(scene), "bus": asdict(bus)}).encode() + b"\n"
+
+
+def decode_options(line: bytes) -> tuple[str, SceneOptions, BusConfig]:
+    """Return rig, scene and bus from one line of `encode_options`."""
+    options = json.loads(line)
+    return options["hal"], SceneOptions(**options["scene"]), BusConfig(**options["bus"])

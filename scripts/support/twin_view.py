@@ -1,4 +1,4 @@
-"""The twin's scene in Rerun, live or in a file: the robot as it stands, the table, and whatever is on it."""
+"""The twin's scene in Rerun, live or in a file: the robot, the table, and the objects on it."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ from z1_runtime.visualization import blueprint
 from z1_runtime.visualization.recorder import Recorder
 
 RATE_HZ = 20.0
-"""How often a live view is brought up to date, or less often under load."""
+"""Rate at which a live view is updated, lower under load [Hz]."""
 
 Drawing = Iterator[tuple[str, Any]]
 
 
 class TwinView:
-    """Shows a twin that runs elsewhere; call `update` as often as it is to be seen.
+    """Recording of a twin that runs elsewhere; each `update` logs its present poses.
 
     Args:
-        twin: what is shown.
-        out: the .rrd file to write, if any.
-        port: TCP port of the live view on the loopback, if there is to be one.
+        twin: the scene to show.
+        out: the .rrd file to write; None writes none.
+        port: TCP port of the live view on the loopback; None serves none.
 
     Raises:
-        z1_runtime.visualization.recorder.ViewerPortError: somebody listens on `port` already.
+        z1_runtime.visualization.recorder.ViewerPortError: another program listens on `port`.
     """
 
     def __init__(self, twin: SceneView, out: Path | None = None, port: int | None = None) -> None:
@@ -41,12 +41,12 @@ class TwinView:
         self._snapshot = mujoco.MjData(twin.model)
 
     def update(self) -> None:
-        """Show the present poses."""
+        """Log the present poses."""
         data = self._twin.snapshot(self._snapshot)
-        self._recorder.write(data.time, "twin", (data,))
+        self._recorder.write(data.time, lambda: self._recorder.draw_twin(data))
 
     def close(self, timeout_s: float = 5.0) -> None:
-        """Hand everything to the viewer or the file, for at most `timeout_s` [s], and let go."""
+        """Flush to the viewer or the file, for at most `timeout_s` [s], and close."""
         self._recorder.close(timeout_s)
 
 
@@ -62,9 +62,10 @@ class _SceneRecorder(Recorder):
         for path, entity in draw_geoms(self._model):
             self._stream.log(path, entity, static=True)
 
-    def _draw_twin(self, data: mujoco.MjData) -> Drawing:
+    def draw_twin(self, data: mujoco.MjData) -> Drawing:
+        """Yield the poses of the arm and of the objects."""
         q = data.qpos[:N_JOINTS].copy()
-        yield from self._robot.draw_pose(q)
+        yield from self.robot.draw_pose(q)
         yield blueprint.POSITION, rr.Scalars(q)
         for body in _free_bodies(self._model):
             rotation = data.xmat[body].reshape(3, 3)
@@ -72,7 +73,7 @@ class _SceneRecorder(Recorder):
 
 
 def draw_geoms(model: mujoco.MjModel) -> Drawing:
-    """Yield every geom of the scene, without the arm, in its body's frame."""
+    """Yield every geom of the scene except the arm's, in its body's frame."""
     for geom in np.flatnonzero(model.geom_group == GROUP_SCENE):
         path = f"{_body_path(model, int(model.geom_bodyid[geom]))}/geom{geom}"
         rotation = np.empty(9)
@@ -83,7 +84,7 @@ def draw_geoms(model: mujoco.MjModel) -> Drawing:
 
 def _shape(model: mujoco.MjModel, geom: int) -> Any:
     size, kind = model.geom_size[geom], mujoco.mjtGeom(model.geom_type[geom])
-    material = int(model.geom_matid[geom])
+    material = int(model.geom_matid[geom])  # -1: the geom has its own colour
     rgba = model.mat_rgba[material] if material >= 0 else model.geom_rgba[geom]
     colour = [(255 * rgba).astype(np.uint8)]
     solid = rr.components.FillMode.Solid
@@ -108,7 +109,7 @@ def _mesh(model: mujoco.MjModel, mesh: int, rgba: np.ndarray) -> rr.Mesh3D:
 
 
 def _free_bodies(model: mujoco.MjModel) -> list[int]:
-    """Return the bodies that stand on the table, free to move."""
+    """Return the bodies on the table that are free to move."""
     return [int(model.jnt_bodyid[j]) for j in np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)]
 
 

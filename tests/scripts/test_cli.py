@@ -1,4 +1,4 @@
-"""The command line: fast to start, one clear line for what a person did wrong, a traceback for what we did."""
+"""The command line: fast to start, one line for an expected error, a traceback for a defect."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Options:
 
     def __post_init__(self) -> None:
         if self.n < 0:
-            raise ValueError(f"n is {self.n}; allowed is 0 and more.")
+            raise InvalidValueError(f"n is {self.n}; allowed is 0 and more.")
 
 
 Options.__module__ = "scripts.made_up"
@@ -55,10 +55,10 @@ def test_every_command_is_a_module_with_a_main() -> None:
         assert callable(import_module(module).main)
 
 
-def test_help_lists_every_command_and_loads_nothing_heavy() -> None:
+def test_help_lists_every_command_and_loads_no_large_package() -> None:
     program = (
         "import sys; from scripts.cli import main; main(['--help']); "
-        "heavy = {'mujoco', 'torch', 'numpy', 'rerun', 'zenoh', 'tyro'} & set(sys.modules); assert not heavy, heavy"
+        "large = {'mujoco', 'torch', 'numpy', 'rerun', 'zenoh', 'tyro'} & set(sys.modules); assert not large, large"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert all(f"  {name} " in done.stdout for name in cli.COMMANDS)
@@ -89,7 +89,7 @@ def test_options_reach_the_command_and_its_code_comes_back(made_up: ModuleType) 
 @pytest.mark.parametrize(
     ("module", "error", "code"),
     [
-        ("hal.servo.servo", HalTimeoutError("nobody answers"), 1),
+        ("hal.servo.servo", HalTimeoutError("no answer"), 1),
         ("numpy", DegenerateCloudError("four points at least"), 1),
         ("hal.registry", UnknownBackendError("arm", "x", ["mock"]), 2),
         ("z1_runtime.config", InvalidValueError("alpha is 3"), 2),
@@ -107,7 +107,7 @@ def test_error_for_the_user_is_one_line(
 
 @pytest.mark.parametrize("module", ["numpy.linalg", "json"])
 def test_defect_shows_its_traceback(made_up: ModuleType, capsys: pytest.CaptureFixture[str], module: str) -> None:
-    made_up.main = raise_in(module, ValueError("not for people"))  # pyright: ignore[reportAttributeAccessIssue]
+    made_up.main = raise_in(module, ValueError("a defect"))  # pyright: ignore[reportAttributeAccessIssue]
     assert cli.main(["made-up"]) == 1
     assert "Traceback" in capsys.readouterr().err
 
@@ -122,7 +122,7 @@ def test_debug_shows_the_traceback_of_any_error(
     made_up: ModuleType, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("Z1_DEBUG", "1")
-    made_up.main = raise_in("hal.servo.servo", HalTimeoutError("nobody answers"))  # pyright: ignore[reportAttributeAccessIssue]
+    made_up.main = raise_in("hal.servo.servo", HalTimeoutError("no answer"))  # pyright: ignore[reportAttributeAccessIssue]
     assert cli.main(["made-up"]) == 1
     assert "Traceback" in capsys.readouterr().err
 

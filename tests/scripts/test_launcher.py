@@ -1,4 +1,4 @@
-"""The launcher sets up once, heals what was broken off, and then only passes on. `uv` and Python are stand-ins."""
+"""The launcher sets up once, repairs an interrupted set-up, and else only forwards. `uv` and Python are fakes."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+
+pytestmark = pytest.mark.integration
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -29,7 +31,7 @@ cp "$(dirname "$0")/fake_python" "$UV_PROJECT_ENVIRONMENT/bin/python"
 
 @dataclass
 class Checkout:
-    """A copy of the launcher beside stand-ins."""
+    """A copy of the launcher with fake tools."""
 
     root: Path
     tools: Path
@@ -67,12 +69,12 @@ def checkout(tmp_path: Path) -> Checkout:
     return Checkout(root, tools)
 
 
-def test_first_start_sets_up_and_says_so_and_the_second_is_silent(checkout: Checkout) -> None:
+def test_first_start_sets_up_with_a_message_and_the_second_is_silent(checkout: Checkout) -> None:
     first, second = checkout.run("--version"), checkout.run("--version")
     assert "GB" in first.stderr
     assert (first.returncode, second.returncode, second.stderr) == (0, 0, "")
     assert checkout.syncs() == 1
-    assert "sync --frozen" in (checkout.tools / "log").read_text()
+    assert "sync --frozen --compile-bytecode" in (checkout.tools / "log").read_text()
 
 
 def test_arguments_folder_and_exit_code_pass_through_a_symlink(checkout: Checkout, tmp_path: Path) -> None:
@@ -87,7 +89,7 @@ def test_arguments_folder_and_exit_code_pass_through_a_symlink(checkout: Checkou
 
 def test_new_lock_sets_up_again(checkout: Checkout) -> None:
     checkout.run()
-    (checkout.root / "uv.lock").write_text("locked anew")
+    (checkout.root / "uv.lock").write_text("locked again")
     checkout.run()
     assert checkout.syncs() == 2
 
@@ -106,13 +108,13 @@ def test_failed_set_up_is_one_clear_error_and_the_next_start_tries_again(checkou
     assert checkout.run().returncode == 0
 
 
-def test_killed_set_up_is_thrown_away_and_built_anew(checkout: Checkout) -> None:
+def test_killed_set_up_is_removed_and_built_again(checkout: Checkout) -> None:
     checkout.run(FAKE_KILLED="1")
     half = checkout.root / ".venv" / "half a package"
     half.touch()
-    healed = checkout.run()
-    assert healed.returncode == 0
-    assert "incomplete" in healed.stderr
+    repaired = checkout.run()
+    assert repaired.returncode == 0
+    assert "incomplete" in repaired.stderr
     assert not half.exists()
 
 
@@ -133,7 +135,7 @@ def test_the_shells_choice_of_gl_is_kept_out(checkout: Checkout) -> None:
     assert checkout.run(MUJOCO_GL="osmesa", PYOPENGL_PLATFORM="osmesa").stdout == "none none\n"
 
 
-def test_without_flock_it_sets_up_all_the_same(checkout: Checkout) -> None:
+def test_set_up_works_without_flock(checkout: Checkout) -> None:
     tools = checkout.tools / "few"
     tools.mkdir()
     for name in ("bash", "readlink", "cksum", "mkdir", "mv", "rm", "cp", "dirname", "sort", "head", "df", "awk"):
@@ -144,21 +146,21 @@ def test_without_flock_it_sets_up_all_the_same(checkout: Checkout) -> None:
     assert checkout.syncs() == 1
 
 
-def test_without_a_fit_python_it_says_what_to_install(checkout: Checkout) -> None:
+def test_without_a_suitable_python_the_error_names_the_package(checkout: Checkout) -> None:
     for name in ("python3", "python3.11", "python3.12", "python3.13", "python3.14", "python"):
         (checkout.tools / name).write_text('#!/bin/bash\n[[ $1 == --version ]] && echo "Python 3.9.2"\nexit 1\n')
         (checkout.tools / name).chmod(0o755)
     done = checkout.run()
     assert done.returncode == 1
-    assert "seen: Python 3.9.2" in done.stderr
+    assert "installed: Python 3.9.2" in done.stderr
     assert "apt install" in done.stderr
     assert checkout.syncs() == 0
 
 
 def test_old_uv_is_not_used(checkout: Checkout) -> None:
-    (checkout.tools / "python3").write_text('#!/bin/bash\n[[ $1 == -c ]] && exit 0\necho "asked for $*"\nexit 1\n')
+    (checkout.tools / "python3").write_text('#!/bin/bash\n[[ $1 == -c ]] && exit 0\necho "called with $*"\nexit 1\n')
     (checkout.tools / "python3").chmod(0o755)
     done = checkout.run(FAKE_UV_VERSION="0.1.0")
     assert done.returncode == 1
-    assert "'uv' could not be fetched" in done.stderr
+    assert "'uv' could not be downloaded" in done.stderr
     assert checkout.syncs() == 0

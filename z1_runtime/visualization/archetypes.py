@@ -1,4 +1,4 @@
-"""The project's types as things Rerun can show; pure functions that yield (entity path, archetype)."""
+"""Rerun archetypes of the project's types; pure functions that yield (entity path, archetype)."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from models.obb.obb import OrientedBox
 from models.types import GraspSet
 from z1_runtime.types import GraspPlan, Observation
 from z1_runtime.visualization import blueprint
-from z1_runtime.visualization.robot_view import Drawing, RobotDrawing
+from z1_runtime.visualization.robot_view import Drawing, RobotView
 
 _JPEG_QUALITY = 80
-_DEPTH_STEPS_PER_M = 1000.0  # 1 mm is finer than a screen shows, and packs far better than 0.1 mm of noise
-_SCENE_POINTS = 30_000
-_PATH_POINTS = 200
+_DEPTH_STEPS_PER_M = 1000.0  # 1 mm is finer than a screen shows, and compresses far better than 0.1 mm of noise
+_SCENE_POINTS = 30_000  # a tenth of a frame's 307 200 pixels
+_PATH_POINTS = 200  # per motion, which has 500 samples a second
 _FINGER_M = 0.04
-_DEFAULT_WIDTH_M = 0.06
+_DEFAULT_WIDTH_M = 0.06  # drawn where the generator gives no width
 _OBJECT_COLOUR = (255, 140, 0)
 _CHOSEN_COLOUR = (0, 220, 90)
 
@@ -37,7 +37,7 @@ def draw_frame(frame: RgbdFrame, T_base_camera: np.ndarray) -> Drawing:
             image_from_camera=k.K,
             resolution=[k.width, k.height],
             camera_xyz=rr.ViewCoordinates.RDF,
-            image_plane_distance=0.08,
+            image_plane_distance=0.08,  # length of the drawn frustum [m]
         ),
     )
     _, jpeg = cv2.imencode(".jpg", frame.colour[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
@@ -51,9 +51,11 @@ def draw_frame(frame: RgbdFrame, T_base_camera: np.ndarray) -> Drawing:
 
 
 def draw_observation(observation: Observation) -> Drawing:
-    """Both clouds in base, and what was detected."""
+    """Both clouds in base, and the detection."""
     T, frame = observation.T_base_camera, observation.frame
-    scene = observation.scene_points[:: max(1, -(-len(observation.scene_points) // _SCENE_POINTS))]
+    scene = observation.scene_points[
+        :: max(1, -(-len(observation.scene_points) // _SCENE_POINTS))
+    ]  # the negations round up
     yield (
         blueprint.SCENE,
         rr.Points3D(_to_base(scene, T), colors=_colours_at(scene, frame.colour, frame.intrinsics), radii=0.001),
@@ -67,7 +69,7 @@ def draw_observation(observation: Observation) -> Drawing:
 
 
 def draw_box(box: OrientedBox | None, faces: np.ndarray, T_base_camera: np.ndarray) -> Drawing:
-    """The box, and of its faces those that may be approached: filled, with their outward normals."""
+    """The box, and its faces that may be approached: filled, with their outward normals."""
     if box is None:
         yield blueprint.BOX, rr.Clear(recursive=False)
         yield blueprint.BOX_FACES, rr.Clear(recursive=True)
@@ -79,7 +81,7 @@ def draw_box(box: OrientedBox | None, faces: np.ndarray, T_base_camera: np.ndarr
     offsets, plates = np.zeros((len(axes), 3)), np.tile(half, (len(axes), 1))
     rows = np.arange(len(axes))
     offsets[rows, axes] = signs * half[axes]
-    plates[rows, axes] = 2e-4
+    plates[rows, axes] = 2e-4  # a face is a box of almost no thickness
     yield blueprint.BOX_FACES, _boxes(T_base_box, offsets, plates, (90, 160, 255, 90), fill="solid")
     yield (
         f"{blueprint.BOX_FACES}/normals",
@@ -100,23 +102,23 @@ def draw_candidates(grasps: GraspSet, T_base_camera: np.ndarray) -> Drawing:
     yield blueprint.CANDIDATES, rr.LineStrips3D(strips, colors=colours.astype(np.uint8), radii=0.0004)
 
 
-def draw_plan(plan: GraspPlan, robot: RobotDrawing) -> Drawing:
-    """The chosen grasp, the pivot's path through transfer, approach and lift, and why others were refused."""
+def draw_plan(plan: GraspPlan, robot: RobotView) -> Drawing:
+    """The chosen grasp, the pivot's path through transfer, approach and lift, and the counts of rejections."""
     strips = gripper_strips(plan.T_base_grasp[None], np.array([plan.width_m]))
     yield blueprint.GRASP, rr.LineStrips3D(strips, colors=_CHOSEN_COLOUR, radii=0.002)
     legs = [leg.q[:: max(1, len(leg.q) // _PATH_POINTS)] for leg in (plan.transfer, plan.approach, plan.lift)]
     colours = [(120, 120, 255), (255, 200, 0), _CHOSEN_COLOUR]
     yield blueprint.PATH, rr.LineStrips3D([robot.pivot_path(q) for q in legs], colors=colours, radii=0.001)
-    refused = Counter(rejection.reason for rejection in plan.rejections)
-    why = ", ".join(f"{n} × {reason}" for reason, n in refused.most_common()) or "none"
+    counts = Counter(rejection.reason for rejection in plan.rejections)
+    rejections = ", ".join(f"{n} × {reason}" for reason, n in counts.most_common()) or "none"
     yield (
         blueprint.LOG,
-        rr.TextLog(f"takes candidate {plan.rank} ({plan.ik_method} joints); refused: {why}", level="INFO"),
+        rr.TextLog(f"candidate {plan.rank} chosen ({plan.ik_method} IK); rejections: {rejections}", level="INFO"),
     )
 
 
-def draw_arm(state: ArmState, status: ServoStatus, robot: RobotDrawing) -> Drawing:
-    """The robot where it is, and its joints against what was commanded."""
+def draw_arm(state: ArmState, status: ServoStatus, robot: RobotView) -> Drawing:
+    """The robot's pose, and its measured and commanded joints."""
     yield from robot.draw_pose(state.q)
     yield blueprint.POSITION, rr.Scalars(state.q)
     yield blueprint.COMMAND, rr.Scalars(status.q_command)
@@ -171,8 +173,8 @@ def _to_base(points: np.ndarray, T_base_camera: np.ndarray) -> np.ndarray:
 
 
 def _colours_at(points: np.ndarray, colour: np.ndarray, k: Intrinsics) -> np.ndarray:
-    """Return the image's colour (N, 3) where `points` (N, 3) in the camera frame were seen."""
-    z = np.maximum(points[:, 2], 1e-6)
+    """Return the image's colour (N, 3) at the pixels of `points` (N, 3), which are in the camera frame."""
+    z = np.maximum(points[:, 2], 1e-6)  # a point at the camera centre has no pixel
     u = np.clip(np.round(k.fx * points[:, 0] / z + k.cx), 0, k.width - 1).astype(int)
     v = np.clip(np.round(k.fy * points[:, 1] / z + k.cy), 0, k.height - 1).astype(int)
     return colour[v, u]

@@ -1,4 +1,4 @@
-"""Where each thing is logged in a Rerun recording, and the layout a viewer opens with."""
+"""Entity paths of a Rerun recording, and the layout of its viewer."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def make_blueprint() -> rrb.Blueprint:
     """Return the layout: scene, both images, joints against command, phases, stage times and log at once."""
     scene = rrb.Spatial3DView(
         origin=WORLD,
-        contents=["$origin/**", f"- {DEPTH}"],  # as a second cloud it would hide the object's
+        contents=["$origin/**", f"- {DEPTH}"],  # as a second cloud it would cover the object's
         name="Scene",
         eye_controls=rrb.EyeControls3D(position=(0.9, -0.9, 0.7), look_target=(0.3, 0.0, 0.2), eye_up=(0.0, 0.0, 1.0)),
     )
@@ -43,14 +43,14 @@ def make_blueprint() -> rrb.Blueprint:
         rrb.TimeSeriesView(origin="joints", contents=[POSITION, COMMAND], name="Joints: measured and commanded [rad]"),
         rrb.TimeSeriesView(origin="joints", contents=TORQUE, name="Torque [Nm]"),
     )
-    words = rrb.Horizontal(
+    texts = rrb.Horizontal(
         rrb.TextDocumentView(origin=STAGES, name="Stage times [ms]"), rrb.TextLogView(origin=LOG, name="Log")
     )
     lanes = rrb.StateTimelineView(origin="states", name="Phase and servo")
-    side = rrb.Vertical(images, plots, lanes, words, row_shares=[3, 3, 2, 2])
+    side = rrb.Vertical(images, plots, lanes, texts, row_shares=[3, 3, 2, 2])
     return rrb.Blueprint(
         rrb.Horizontal(scene, side, column_shares=[3, 2]),
-        rrb.TimePanel(state="collapsed", timeline=TIMELINE),
+        rrb.TimePanel(state="collapsed", timeline=TIMELINE),  # the panels leave the space to the scene
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
     )

@@ -1,4 +1,4 @@
-"""Shows what the camera sees while the arm moves; a thread of its own, which nobody waits for."""
+"""Frames of the wrist camera in the recording while the arm moves, from a thread of their own."""
 
 from __future__ import annotations
 
@@ -11,43 +11,43 @@ from hal.base import z1
 from hal.base.arm import Arm
 from hal.base.camera import Camera
 from hal.base.errors import HalError
-from z1_runtime.geometry.kinematics import Kinematics
+from hal.base.z1_model import ForwardKinematics
 from z1_runtime.visualization.rerun_logger import RerunLogger
 
 _LOG = logging.getLogger(__name__)
-_PATIENCE_S = 1.0
+_FRAME_TIMEOUT_S = 1.0
 
 
 class LiveView:
-    """Hands frames to the inspector, with the camera's pose at that moment; few, since each costs the HAL a picture.
+    """Thread that logs frames with the camera's pose at that moment, at a low rate: the HAL encodes each of them.
 
-    For devices that live by the wall clock; in lock-step, waiting for a frame would move time.
+    For devices on the wall clock; in lock-step, waiting for a frame would move time.
 
     Args:
-        camera: connected; others may wait for its frames too.
+        camera: connected; other threads may wait for its frames too.
         arm: connected.
-        inspector: gets the frames.
+        logger: receives the frames.
         T_flange_camera: (4, 4) hand-eye transform.
-        rate_hz: most frames a second.
+        rate_hz: highest rate of frames [Hz].
     """
 
     def __init__(
         self,
         camera: Camera,
         arm: Arm,
-        inspector: RerunLogger,
+        logger: RerunLogger,
         T_flange_camera: np.ndarray = z1.T_FLANGE_CAMERA,
         *,
         rate_hz: float = 4.0,
     ) -> None:
         self._camera = camera
         self._arm = arm
-        self._inspector = inspector
+        self._logger = logger
         self._T_flange_camera = T_flange_camera
-        self._kinematics = Kinematics()
+        self._kinematics = ForwardKinematics()
         self._period_s = 1.0 / rate_hz
         self._closing = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="frame tap", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="live view", daemon=True)
 
     def __enter__(self) -> LiveView:
         self._thread.start()
@@ -55,14 +55,14 @@ class LiveView:
 
     def __exit__(self, *_: object) -> None:
         self._closing.set()
-        self._thread.join()
+        self._thread.join()  # before the devices disconnect
 
     def _run(self) -> None:
         while not self._closing.wait(self._period_s):
             try:
-                frame = self._camera.wait_for_frame(_PATIENCE_S)
+                frame = self._camera.wait_for_frame(_FRAME_TIMEOUT_S)
                 q = self._arm.read_state().q[: z1.N_ARM]
             except HalError as err:
-                _LOG.warning("no more frames are shown: %s", err)
+                _LOG.warning("the live view ends: %s", err)
                 return
-            self._inspector.log_frame(frame, self._kinematics.flange(q) @ self._T_flange_camera)
+            self._logger.log_frame(frame, self._kinematics.flange(q) @ self._T_flange_camera)

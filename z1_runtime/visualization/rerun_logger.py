@@ -1,13 +1,13 @@
-"""Everything a person can look at afterwards or live, in Rerun; the callers never wait for it."""
+"""Queue between the task and a Rerun recording, so that logging never delays a motion."""
 
 from __future__ import annotations
 
 import logging
 import threading
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -16,18 +16,21 @@ from models.obb.obb import OrientedBox
 from models.types import GraspSet
 from z1_runtime.types import GraspPlan, Observation
 
+if TYPE_CHECKING:  # an idle logger does not load Rerun
+    from z1_runtime.visualization.robot_view import Drawing
+
 logger = logging.getLogger(__name__)
 
-_Job = tuple[float, str, tuple[Any, ...]]
-"""Stamp [s], what to draw, and its arguments."""
+_Job = tuple[float, "Callable[[], Drawing]"]
+"""Stamp [s] and the call that draws the entry."""
 
 
 class RerunLogger:
-    """Writes a recording to a file, a live view, both, or nowhere.
+    """Recording of a run, to a file, a live view, both, or neither.
 
-    Calls only queue: a worker draws. Frames wait in a short queue of their own and are drawn last, so under load
-    they are dropped first, oldest first (`frames_dropped`); anything else is lost only when thousands wait (`lost`).
-    Times are the messages' own; what carries none gets the newest one seen.
+    Calls only queue: a worker draws. Frames have a short queue of their own and are drawn last, so under load
+    they are dropped first, oldest first (`frames_dropped`); other entries are lost only when thousands queue (`lost`).
+    Times are the messages' own; entries without one get the newest so far.
     """
 
     def __init__(
@@ -41,19 +44,19 @@ class RerunLogger:
         max_frames: int = 4,
         max_jobs: int = 4096,
     ) -> None:
-        """Open the sinks; with neither `out` nor `live`, do nothing from here on.
+        """Open the sinks; with neither `out` nor `live`, every call is ignored.
 
         Args:
             out: the .rrd file to write; its folder is made.
             live: serve on 127.0.0.1 and open the viewer if there is a screen.
             port: TCP port of the live view.
-            frame_rate_hz: more frames than this are left out on purpose (not counted as dropped).
-            arm_rate_hz: the same for arm states.
-            max_frames: how many frames may wait.
-            max_jobs: how much else may wait.
+            frame_rate_hz: highest rate of frames; others are skipped and not counted as dropped.
+            arm_rate_hz: highest rate of arm states.
+            max_frames: capacity of the frame queue.
+            max_jobs: capacity of the queue of other entries.
 
         Raises:
-            recorder.ViewerPortError: somebody listens on `port` already.
+            recorder.ViewerPortError: another program listens on `port`.
         """
         self.frames_dropped = 0
         self.lost = 0
@@ -68,53 +71,61 @@ class RerunLogger:
         self._closing = False
         self._worker: threading.Thread | None = None
         if out is not None or live:
-            from z1_runtime.visualization.recorder import Recorder  # an idle inspector does not load Rerun
+            from z1_runtime.visualization import archetypes
+            from z1_runtime.visualization.recorder import Recorder
 
+            self._archetypes = archetypes
             self._recorder = Recorder(out, port if live else None)
-            self._worker = threading.Thread(target=self._work, name="inspector", daemon=True)
+            self._worker = threading.Thread(target=self._work, name="rerun logger", daemon=True)
             self._worker.start()
 
+    @property
+    def active(self) -> bool:
+        """True while entries are written to a file or a live view."""
+        return self._worker is not None
+
     def log_frame(self, frame: RgbdFrame, T_base_camera: np.ndarray) -> None:
-        """Show camera, colour and depth; `T_base_camera` (4, 4) at the time of the frame."""
+        """Log camera pose, colour and depth; `T_base_camera` (4, 4) at the time of the frame."""
         if self._is_due("frame", frame.stamp_s, self._frame_gap_s):
-            self._put(frame.stamp_s, "frame", frame, T_base_camera, is_frame=True)
+            self._put(frame.stamp_s, lambda: self._archetypes.draw_frame(frame, T_base_camera), is_frame=True)
 
     def log_observation(self, observation: Observation) -> None:
-        """Show object and scene cloud; the frame they came from is always kept."""
+        """Log object and scene cloud; their frame is never dropped."""
         stamp_s = observation.frame.stamp_s
-        self._put(stamp_s, "frame", observation.frame, observation.T_base_camera)
-        self._put(stamp_s, "observation", observation)
+        self._put(stamp_s, lambda: self._archetypes.draw_frame(observation.frame, observation.T_base_camera))
+        self._put(stamp_s, lambda: self._archetypes.draw_observation(observation))
 
     def log_box(self, box: OrientedBox | None, faces: np.ndarray, T_base_camera: np.ndarray) -> None:
-        """Show the box with the `faces` (k,) that may be approached; None clears it."""
-        self._put(None, "box", box, faces, T_base_camera)
+        """Log the box with the `faces` (k,) that may be approached; None clears it."""
+        self._put(None, lambda: self._archetypes.draw_box(box, faces, T_base_camera))
 
     def log_candidates(self, grasps: GraspSet, T_base_camera: np.ndarray) -> None:
-        """Show all candidates, coloured by score."""
-        self._put(None, "candidates", grasps, T_base_camera)
+        """Log all candidates, coloured by score."""
+        self._put(None, lambda: self._archetypes.draw_candidates(grasps, T_base_camera))
 
     def log_plan(self, plan: GraspPlan) -> None:
-        """Show the chosen grasp and the pivot's path."""
-        self._put(None, "plan", plan)
+        """Log the chosen grasp and the pivot's path."""
+        self._put(None, lambda: self._archetypes.draw_plan(plan, self._recorder.robot))
 
     def log_arm(self, state: ArmState, status: ServoStatus) -> None:
-        """Show the robot, joints against command, and the servo's mode."""
+        """Log the robot, measured and commanded joints, and the servo's mode."""
         if (status.mode, status.reason) != self._servo:
             self._servo = (status.mode, status.reason)
-            self._put(state.stamp_s, "servo_change", status)
+            self._put(state.stamp_s, lambda: self._archetypes.draw_servo_change(status))
         if self._is_due("arm", state.stamp_s, self._arm_gap_s):
-            self._put(state.stamp_s, "arm", state, status)
+            self._put(state.stamp_s, lambda: self._archetypes.draw_arm(state, status, self._recorder.robot))
 
     def log_phase(self, name: str, t_s: float) -> None:
-        """Start the phase `name` at `t_s` [s]."""
-        self._put(t_s, "phase", name)
+        """Log the start of the phase `name` at `t_s` [s]."""
+        self._put(t_s, lambda: self._archetypes.draw_phase(name))
 
     def log_stage_times(self, stage_ms: Mapping[str, float]) -> None:
-        """Show how long each stage took [ms]."""
-        self._put(None, "stage_times", dict(stage_ms))
+        """Log the duration of each stage [ms]."""
+        times = dict(stage_ms)
+        self._put(None, lambda: self._archetypes.draw_stage_times(times))
 
     def close(self, timeout_s: float = 5.0) -> None:
-        """Write what waits, for at most about `timeout_s`, and close the sinks. Harmless when closed."""
+        """Write the queues, for at most about `timeout_s` [s], and close the sinks. Harmless when closed."""
         worker, self._worker = self._worker, None
         if worker is None:
             return
@@ -123,18 +134,18 @@ class RerunLogger:
             self._wake.notify()
         worker.join(timeout_s)
         if worker.is_alive():
-            logger.warning("the inspector was still writing after %.1f s; the recording lacks the end", timeout_s)
+            logger.warning("the recording was not finished after %.1f s; it lacks the end", timeout_s)
         self._recorder.close(timeout_s)
         if self.frames_dropped or self.lost:
-            logger.info("the inspector dropped %d frames and lost %d entries", self.frames_dropped, self.lost)
+            logger.info("the recording dropped %d frames and lost %d entries", self.frames_dropped, self.lost)
 
     def _is_due(self, lane: str, stamp_s: float, gap_s: float) -> bool:
-        if stamp_s - self._last_s[lane] < gap_s * (1.0 - 1e-6):
+        if stamp_s - self._last_s[lane] < gap_s * (1.0 - 1e-6):  # rounding of stamps at exactly the rate
             return False
         self._last_s[lane] = stamp_s
         return True
 
-    def _put(self, stamp_s: float | None, kind: str, *args: Any, is_frame: bool = False) -> None:
+    def _put(self, stamp_s: float | None, draw: Callable[[], Drawing], *, is_frame: bool = False) -> None:
         if self._worker is None:
             return
         with self._wake:
@@ -146,7 +157,7 @@ class RerunLogger:
             elif not is_frame and len(self._jobs) >= self._max_jobs:
                 self.lost += 1
                 return
-            (self._frames if is_frame else self._jobs).append((stamp_s, kind, args))
+            (self._frames if is_frame else self._jobs).append((stamp_s, draw))
             self._wake.notify()
 
     def _work(self) -> None:
@@ -154,11 +165,11 @@ class RerunLogger:
             self._recorder.write_static()
             while (job := self._next_job()) is not None:
                 self._recorder.write(*job)
-        except Exception:  # a fault in the pictures must not end a pick; the queues fill up and count what is lost
-            logger.exception("the inspector failed; the recording ends here")
+        except Exception:  # a fault in a drawing must not end a pick; the queues fill up and count the lost entries
+            logger.exception("drawing failed; the recording ends here")
 
     def _next_job(self) -> _Job | None:
         with self._wake:
             self._wake.wait_for(lambda: self._jobs or self._frames or self._closing)
-            lane = self._jobs or self._frames
+            lane = self._jobs or self._frames  # frames last, so that under load they are the ones dropped
             return lane.popleft() if lane else None

@@ -1,4 +1,4 @@
-"""The doctor's table stands whatever the machine, or a check, does."""
+"""The doctor prints its table on every machine, also when a check raises."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ def check_that_breaks() -> Check:
     raise RuntimeError("inside the check")
 
 
-def test_demo_can_run_when_only_welcome_things_are_missing(
+def test_demo_can_run_when_only_optional_parts_are_missing(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(doctor, "NEEDED", (check_good,))
-    monkeypatch.setattr(doctor, "WELCOME", (check_bad, check_that_breaks))
+    monkeypatch.setattr(doctor, "REQUIRED", (check_good,))
+    monkeypatch.setattr(doctor, "OPTIONAL", (check_bad, check_that_breaks))
     assert doctor.main(doctor.DoctorConfig()) == 0
     out = capsys.readouterr().out
     assert "[gone]" in out
@@ -44,11 +44,11 @@ def test_demo_can_run_when_only_welcome_things_are_missing(
     assert "ready: ./z1 demo" in out
 
 
-def test_demo_cannot_run_when_something_needed_is_missing(
+def test_demo_cannot_run_when_a_required_part_is_missing(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(doctor, "NEEDED", (check_good, check_bad))
-    monkeypatch.setattr(doctor, "WELCOME", ())
+    monkeypatch.setattr(doctor, "REQUIRED", (check_good, check_bad))
+    monkeypatch.setattr(doctor, "OPTIONAL", ())
     assert doctor.main(doctor.DoctorConfig()) == 1
     assert "cannot run yet: see bad" in capsys.readouterr().out
 
@@ -57,17 +57,17 @@ def test_broken_check_becomes_a_row() -> None:
     (row,) = doctor.run_checks([check_that_breaks])
     assert row.state is State.MISSING
     assert row.name == "that breaks"
-    assert "inside the check" in row.seen
+    assert "inside the check" in row.found
 
 
 def test_every_check_answers_on_this_machine() -> None:
-    for row in doctor.run_checks([*doctor.NEEDED, *doctor.WELCOME]):
-        assert "check itself failed" not in row.seen, row
-        assert row.seen
+    for row in doctor.run_checks([*doctor.REQUIRED, *doctor.OPTIONAL]):
+        assert "check itself failed" not in row.found, row
+        assert row.found
         assert row.fix or row.state is State.OK
 
 
-def test_port_taken_by_a_stranger_keeps_the_demo_from_running(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_port_taken_by_another_program_prevents_the_demo(monkeypatch: pytest.MonkeyPatch) -> None:
     with socket.socket() as other:
         other.bind(("127.0.0.1", 0))
         other.listen()
@@ -75,7 +75,7 @@ def test_port_taken_by_a_stranger_keeps_the_demo_from_running(monkeypatch: pytes
         monkeypatch.setattr("hal.bus.session.BusConfig", partial(BusConfig, port=port))
         row = checks.check_bus_port()
     assert row.state is State.MISSING
-    assert f"{port} is taken" in row.seen
+    assert f"{port} is taken" in row.found
     assert "./z1 demo --port" in row.fix
 
 
@@ -93,19 +93,19 @@ def test_port_taken_by_our_own_hal_is_a_warning(monkeypatch: pytest.MonkeyPatch)
     camera.disconnect()
     servo.disconnect()
     assert row.state is State.WARN
-    assert "our own HAL process" in row.seen
-    assert "servo holding at 0.0 Hz" in row.seen
-    assert "no command owner" in row.seen
+    assert "a HAL process of this project" in row.found
+    assert "servo holding at 0.0 Hz" in row.found
+    assert "no command owner" in row.found
     assert "./z1 run" in row.fix
 
 
 def test_missing_packages_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(checks, "_MODULES", ("numpy", "not_a_package"))
     row = checks.check_packages()
-    assert (row.state, row.seen) == (State.MISSING, "not installed: not_a_package")
+    assert (row.state, row.found) == (State.MISSING, "not installed: not_a_package")
 
 
-def test_full_disk_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_full_disk_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("shutil.disk_usage", lambda path: SimpleNamespace(free=1e6))
     assert checks.check_disk().state is State.MISSING
     assert checks.check_shared_memory().state is State.WARN
@@ -115,22 +115,22 @@ def test_missing_opengl_is_a_warning_with_its_fix(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(checks, "_run_python", lambda *args, **more: (1, "Traceback\nImportError: no libEGL"))
     row = checks.check_graphics()
     assert row.state is State.WARN
-    assert "no libEGL" in row.seen
+    assert "no libEGL" in row.found
     assert "apt install" in row.fix
 
 
-def test_driver_that_hangs_is_given_up() -> None:
+def test_hanging_driver_times_out() -> None:
     code, out = checks._run_python("import threading; threading.Event().wait()", timeout_s=0.5)
     assert code != 0
     assert "no answer" in out
 
 
-def test_arm_on_the_right_network_is_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_arm_is_probed_on_its_own_network_only(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(checks, "ARM_ADDRESS", "127.0.0.1")
     assert checks._is_there("127.0.0.1")
-    assert "not configured" in checks.check_arm().seen  # we speak from 127.0.0.1, not from the arm's network
+    assert "not configured" in checks.check_arm().found  # the route starts at 127.0.0.1, not in the arm's network
 
 
-def test_doctor_reads_the_root_of_this_checkout() -> None:
+def test_doctor_uses_the_root_of_this_checkout() -> None:
     assert (checks.ROOT / "pyproject.toml").is_file()
     assert Path(doctor.__file__).is_relative_to(checks.ROOT)

@@ -1,4 +1,4 @@
-"""The main job end to end, as a user types it: processes, exit codes, files."""
+"""The demo end to end, as a user types it: processes, exit codes, files."""
 
 from __future__ import annotations
 
@@ -22,14 +22,16 @@ from hal.bus.service import Listener
 from hal.bus.session import BusConfig, open_session
 from scripts import cli
 
+pytestmark = pytest.mark.integration
+
 LIFTED_M = 0.05
 TIMES = ("stage_ms", "servo", "zenoh")
 SERVER_PERIOD_S = 0.010
 
 
 @pytest.fixture(scope="module", autouse=True)
-def heed_ctrl_c() -> Iterator[None]:
-    """A suite started in the background of a shell ignores Ctrl-C, and would hand that down to its children."""
+def default_ctrl_c() -> Iterator[None]:
+    """Restore Ctrl-C, which a suite in the background of a shell ignores, and its children with it."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
@@ -58,7 +60,7 @@ def read_summary(folder: Path) -> dict:
 # --- The pick -----------------------------------------------------------------------------------------------
 
 
-def test_the_demo_lifts_the_bottle_with_two_processes_over_zenoh(tmp_path: Path) -> None:
+def test_demo_lifts_the_bottle_with_two_processes_over_zenoh(tmp_path: Path) -> None:
     demo = z1("demo", f"--out={tmp_path}", f"--port={free_port()}")
     out, err = demo.communicate(timeout=240)
     assert demo.returncode == 0, err
@@ -101,7 +103,7 @@ def test_without_opengl_the_cylinder_is_lifted_and_drawn_all_the_same(
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "value"),
     [
         (["--object=teapot"], "teapot"),
         (["--distance-m=2.0"], "2.0"),
@@ -110,19 +112,19 @@ def test_without_opengl_the_cylinder_is_lifted_and_drawn_all_the_same(
         (["--config=missing.yaml"], "missing.yaml"),
     ],
 )
-def test_bad_input_is_one_clear_error_and_no_success_is_left_behind(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str], arguments: list[str], said: str
+def test_bad_input_is_one_error_and_leaves_no_success(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], arguments: list[str], value: str
 ) -> None:
     (tmp_path / "summary.json").write_text('{"success": true}')
     assert cli.main(["demo", f"--out={tmp_path}", f"--port={free_port()}", *arguments]) == 2
     err = capfd.readouterr().err
-    assert said in err
+    assert value in err
     assert err.startswith("error: ") and len(err.strip().splitlines()) == 1
     summary = tmp_path / "summary.json"
     assert not summary.exists() or not read_summary(tmp_path)["success"]
 
 
-def test_a_taken_port_is_one_clear_error(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_taken_port_is_one_error(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
@@ -134,7 +136,7 @@ def test_a_taken_port_is_one_clear_error(tmp_path: Path, capfd: pytest.CaptureFi
 
 
 def demo_in_motion(out: Path) -> tuple[subprocess.Popen[str], int]:
-    """Return a demo that is on its way to the object, and the number of its HAL process."""
+    """Return a demo in mid-motion, and the id of its HAL process."""
     demo = z1("demo", f"--out={out}", f"--port={free_port()}")
     assert demo.stdout is not None
     for line in demo.stdout:
@@ -156,7 +158,7 @@ def test_ctrl_c_in_mid_motion_ends_both_processes_in_order(tmp_path: Path) -> No
     assert not read_summary(tmp_path)["success"]
 
 
-def test_a_hal_that_dies_in_mid_motion_is_one_clear_error(tmp_path: Path) -> None:
+def test_killed_hal_in_mid_motion_is_one_error(tmp_path: Path) -> None:
     demo, hal = demo_in_motion(tmp_path)
     subprocess.run(["kill", "-KILL", str(hal)], check=True)
     _, err = demo.communicate(timeout=120)
@@ -172,7 +174,7 @@ def test_a_hal_that_dies_in_mid_motion_is_one_clear_error(tmp_path: Path) -> Non
 
 @pytest.fixture(scope="module")
 def bus() -> Iterator[BusConfig]:
-    """A HAL process of the twin."""
+    """Start a HAL process of the twin."""
     bus = BusConfig(port=free_port(), connect_timeout_s=10.0)
     hal = z1("hal", "--hal=sim", f"--port={bus.port}")
     assert hal.stdout is not None and hal.stdout.readline().strip() == "ready"
@@ -183,7 +185,7 @@ def bus() -> Iterator[BusConfig]:
 
 @pytest.fixture
 def runtime(bus: BusConfig) -> Iterator[subprocess.Popen[str]]:
-    """A pick that has just begun."""
+    """Start a pick."""
     runtime = z1("run", f"--port={bus.port}")
     yield runtime
     end(runtime)
@@ -213,7 +215,7 @@ def wait_for_rest(arm: RemoteArm) -> ServoStatus:
 
 def assert_still(arm: RemoteArm, for_s: float = 0.5) -> None:
     clock = WallClock()
-    clock.sleep_until(clock.now_s() + 0.2)  # the arm comes to rest behind its command
+    clock.sleep_until(clock.now_s() + 0.2)  # the arm comes to rest after its command
     q_command, q = arm.status().q_command[:6], arm.read_state().q[:6]
     clock.sleep_until(clock.now_s() + for_s)
     assert np.array_equal(arm.status().q_command[:6], q_command)
@@ -237,7 +239,7 @@ def test_killing_the_runtime_in_mid_motion_brakes_the_arm_within_04_s(
     assert_still(witness)
     listener.close()
     session.close()
-    # By the servo's own stamps: when this test looked does not matter.
+    # By the servo's own stamps, which the load of this process does not delay.
     rest_s = next(status.stamp_s for status in published if status.mode is ServoMode.HOLDING)
     assert rest_s - killed_s <= 0.4 + SERVER_PERIOD_S
 
@@ -248,8 +250,8 @@ def test_stop_in_mid_motion_latches_until_rearmed(
     wait_for_motion(witness, runtime)
     assert cli.main(["stop", f"--port={bus.port}"]) == 0
     assert wait_for_rest(witness).mode is ServoMode.STOPPED
-    _, said = runtime.communicate(timeout=120)
-    assert runtime.returncode == 1 and said.startswith("error: ")
+    _, err = runtime.communicate(timeout=120)
+    assert runtime.returncode == 1 and err.startswith("error: ")
     assert_still(witness)
     capfd.readouterr()
     assert cli.main(["run", f"--port={bus.port}"]) == 1

@@ -15,6 +15,9 @@ from hal.base.messages import ServoMode, TrajectoryChunk
 from hal.bus.client import RemoteArm
 from hal.bus.session import BusConfig
 from scripts import cli
+from tests.support.errors import raises
+
+pytestmark = pytest.mark.integration
 
 
 @pytest.fixture
@@ -45,8 +48,9 @@ def test_stop_latches_until_rearm(port: int, capsys: pytest.CaptureFixture[str])
             trajectory_id=1, t_s=np.array([0.0, 0.1]), q=np.array([q, q]), dq=np.zeros((2, 7)), final=True
         )
         arm.claim()
-        with pytest.raises(StoppedError, match="a test"):
+        with raises(StoppedError, "stopped") as caught:
             arm.stream(stay)
+        assert "a test" in str(caught.value)  # the reason, over the bus
         assert cli.main(["rearm", *arguments]) == 0
         assert "servo: holding" in capsys.readouterr().out
         arm.claim()

@@ -1,4 +1,4 @@
-"""One word chooses the hardware, for `./z1 hal` and `./z1 demo`."""
+"""One option selects the hardware, for `./z1 hal` and `./z1 demo`."""
 
 from __future__ import annotations
 
@@ -10,13 +10,14 @@ from importlib.util import find_spec
 import pytest
 import tyro
 
-from hal.base.errors import CommandRejectedError, LeaseError
+from hal.base.errors import CommandRejectedError, InvalidValueError, LeaseError
 from hal.bus.client import RemoteArm, RemoteCamera
 from hal.bus.session import BusConfig
 from hal.rig import RIGS
 from scripts.commands import run_demo, run_hal
 from scripts.support.rig_option import RigOption
 from sim_twin.drop_in.rig import free_ports
+from tests.support.errors import raises
 
 
 def free_tcp_port() -> int:
@@ -33,24 +34,34 @@ def free_tcp_port() -> int:
         *(([f"--{name}"], name) for name in RIGS.names()),
     ],
 )
-def test_every_rig_has_its_word_and_its_name(arguments: list[str], name: str) -> None:
+def test_every_rig_has_its_flag_and_its_name(arguments: list[str], name: str) -> None:
     assert tyro.cli(run_hal.Config, args=arguments).rig.name == name
 
 
-def test_two_words_are_one_too_many(capsys: pytest.CaptureFixture[str]) -> None:
+def test_two_flags_are_an_error(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         tyro.cli(run_hal.Config, args=["--real", "--sim"])
     assert "not allowed together" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("word", [RigOption(real=True), RigOption(mock=True)])
-def test_a_demo_of_other_hardware_than_the_twin_is_refused_with_the_way_to_it(word: RigOption) -> None:
-    with pytest.raises(ValueError, match=f"./z1 hal --hal {word.name}, and beside it ./z1 run"):
-        run_demo.Config(rig=word)
+@pytest.mark.parametrize("rig", [RigOption(real=True), RigOption(mock=True)])
+def test_demo_of_other_hardware_is_rejected_with_the_commands_for_it(rig: RigOption) -> None:
+    with raises(InvalidValueError, "no_ground_truth") as caught:
+        run_demo.Config(rig=rig)
+    text = str(caught.value)
+    assert (
+        rig.name in text and "sim or wire-sim" in text and f"./z1 hal --hal {rig.name}" in text and "./z1 run" in text
+    )
 
 
+def test_lockstep_has_one_rig() -> None:
+    with raises(InvalidValueError, "lockstep_rig"):
+        run_demo.Config(rig=RigOption(wire_sim=True), lockstep=True)
+
+
+@pytest.mark.integration
 @pytest.mark.skipif(find_spec("pyrealsense2") is None, reason="pyrealsense2 has no wheel for this platform")
-def test_without_arm_and_camera_the_address_and_the_device_tried_are_named() -> None:
+def test_without_arm_and_camera_the_error_names_address_and_device() -> None:
     command_port, state_port = free_ports()
     options = [f"--arm.command-port={command_port}", f"--arm.state-port={state_port}", f"--port={free_tcp_port()}"]
     command = [sys.executable, "-m", "scripts.cli", "hal", "--real", *options]
@@ -61,7 +72,8 @@ def test_without_arm_and_camera_the_address_and_the_device_tried_are_named() -> 
         assert words in error
 
 
-def test_a_readonly_hal_publishes_states_and_frames_and_commands_nothing() -> None:
+@pytest.mark.integration
+def test_readonly_hal_publishes_states_and_frames_and_commands_nothing() -> None:
     bus = BusConfig(port=free_tcp_port(), connect_timeout_s=20.0)
     options = ["--mock", "--readonly", f"--port={bus.port}", "--until-stdin-closes"]
     command = [sys.executable, "-m", "scripts.cli", "hal", *options]
@@ -72,10 +84,10 @@ def test_a_readonly_hal_publishes_states_and_frames_and_commands_nothing() -> No
         with RemoteArm(bus) as arm, RemoteCamera(bus) as camera:
             assert arm.read_state().q.shape == (7,)
             assert camera.wait_for_frame(20.0).depth_m.any()
-            with pytest.raises(LeaseError, match="monitor-only"):
+            with pytest.raises(LeaseError):
                 arm.claim()
-            with pytest.raises(CommandRejectedError, match="cannot stop the arm"):
-                arm.stop("a hand came near")
+            with pytest.raises(CommandRejectedError):
+                arm.stop("a person came near")
     finally:
         hal.stdin.close()
         assert hal.wait() == 0

@@ -1,4 +1,4 @@
-"""The twin in Rerun: what stands there is drawn where it is, and moves when it moves."""
+"""The twin in Rerun: objects are drawn at their poses, and move with them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from sim_twin.model.world import World
 from z1_runtime.visualization import blueprint
 
 
-def test_a_recording_holds_the_robot_and_the_things_and_how_they_move(tmp_path: Path) -> None:
+def test_recording_holds_robot_and_objects_and_their_motion(tmp_path: Path) -> None:
     world, file = World(SceneConfig()), tmp_path / "twin.rrd"
     view = TwinView(world, out=file)
     view.update()
@@ -36,9 +36,9 @@ def test_a_recording_holds_the_robot_and_the_things_and_how_they_move(tmp_path: 
     assert sum(path.startswith("world/twin/world/geom") for path in paths) >= 2  # floor and table
 
 
-@pytest.mark.parametrize("thing", ["bottle", "box", "cylinder"])
-def test_every_geom_of_the_scene_has_a_shape(thing: str) -> None:
-    model = World(SceneConfig(object=thing)).model
+@pytest.mark.parametrize("name", ["bottle", "box", "cylinder"])
+def test_every_geom_of_the_scene_has_a_shape(name: str) -> None:
+    model = World(SceneConfig(object=name)).model
     drawn = list(draw_geoms(model))
     shapes = [entity for _, entity in drawn if not isinstance(entity, rr.Transform3D)]
     assert 2 * len(shapes) == len(drawn)

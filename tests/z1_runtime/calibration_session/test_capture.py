@@ -17,11 +17,12 @@ from hal.base import z1
 from hal.base.messages import ArmState, RgbdFrame
 from hal.base.transforms import pose_error
 from scripts.support.calibration_robot import CalibrationRobot, RobotOptions, open_robot
-from scripts.support.demo_robot import lockstep_robot
+from sim_twin.backends import make_rig
 from sim_twin.model.scene import SceneConfig
 from tests.support.errors import raises
 from z1_runtime.calibration_session.board_search import BoardSearch, capture_still_frame
 from z1_runtime.calibration_session.capture import Key, SampleCapture
+from z1_runtime.devices import connect_rig
 from z1_runtime.geometry.kinematics import Kinematics
 from z1_runtime.motion.executor import Executor, MotionError
 from z1_runtime.motion.trajectory import MotionLimits, joint_move
@@ -50,14 +51,14 @@ def folder(robot: CalibrationRobot, tmp_path_factory: pytest.TempPathFactory) ->
     folder = tmp_path_factory.mktemp("samples")
     first = capture_into(folder, robot)
     assert first.open("2026-01-01T00:00:00+00:00") == 0
-    pictures = first.capture_automatically(search_with(robot), wanted=3)
+    pictures = first.capture_automatically(search_with(robot), n_samples=3)
     name = next(pictures).name
     pictures.close()  # as Ctrl-C does
     assert [path.stem for path in folder.glob("0*.json")] == [name]
 
     second = capture_into(folder, robot)
     assert second.open("2026-01-01T00:01:00+00:00") == 1
-    assert sum(bool(captured.name) for captured in second.capture_automatically(search_with(robot), wanted=3)) == 2
+    assert sum(bool(captured.name) for captured in second.capture_automatically(search_with(robot), n_samples=3)) == 2
     assert len(second.captured) == 3
     return folder
 
@@ -139,13 +140,13 @@ def test_operator_captures_and_ends_and_nothing_moves_the_arm(robot: Calibration
 
 def test_table_without_the_board_is_reported(tmp_path: Path):
     with ExitStack() as undo:
-        robot = undo.enter_context(lockstep_robot(SceneConfig(object="box")))
+        robot = undo.enter_context(connect_rig(make_rig(SceneConfig(object="box"), lockstep=True)))
         robot.arm.claim("test")
         devices = {"arm": robot.arm, "camera": robot.camera, "clock": robot.clock, "board": BOARD}
         capture = SampleCapture(**devices, folder=tmp_path)
         capture.open("2026-01-01T00:00:00+00:00")
         with raises(CalibrationError, "no_board"):
-            next(capture.capture_automatically(BoardSearch(**devices, speed=1.0), wanted=3))
+            next(capture.capture_automatically(BoardSearch(**devices, speed=1.0), n_samples=3))
         assert not load_samples(tmp_path).samples
 
 

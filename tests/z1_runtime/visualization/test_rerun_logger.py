@@ -1,4 +1,4 @@
-"""The recording holds what was logged, where the layout looks for it, and never holds anyone up."""
+"""The recording holds the logged entries at the layout's paths, and never delays its callers."""
 
 from __future__ import annotations
 
@@ -18,13 +18,14 @@ from hal.base import z1
 from hal.base.messages import ArmState, Intrinsics, RgbdFrame, ServoMode, ServoStatus
 from models.obb.obb import OrientedBox
 from models.types import Detection, GraspSet
+from tests.support.errors import raises
 from z1_runtime.geometry.kinematics import Kinematics
 from z1_runtime.types import GraspPlan, JointTrajectory, Observation, Plane, Rejection
 from z1_runtime.visualization import blueprint
 from z1_runtime.visualization.archetypes import gripper_strips
 from z1_runtime.visualization.recorder import Recorder, ViewerPortError
 from z1_runtime.visualization.rerun_logger import RerunLogger
-from z1_runtime.visualization.robot_view import RobotDrawing
+from z1_runtime.visualization.robot_view import LINKS, RobotView
 
 K = Intrinsics(width=64, height=48, fx=60.0, fy=60.0, cx=31.5, cy=23.5)
 Q = np.append(z1.Q_HOME, -1.0)
@@ -94,20 +95,20 @@ def make_grasps(n: int) -> GraspSet:
     )
 
 
-def log_everything(inspector: RerunLogger) -> None:
+def log_everything(logger: RerunLogger) -> None:
     box = OrientedBox(
         T_camera_box=np.eye(4), half_extents_m=np.array([0.03, 0.04, 0.1]), unobserved=np.zeros(3, dtype=bool)
     )
-    inspector.log_phase("look", 0.0)
+    logger.log_phase("look", 0.0)
     for step in range(20):
-        inspector.log_arm(*make_arm(step / 10))
-        inspector.log_frame(make_frame(step / 10), np.eye(4))
-    inspector.log_arm(*make_arm(2.0, ServoMode.BRAKING))
-    inspector.log_observation(make_observation(2.0))
-    inspector.log_box(box, np.array([1, 4]), np.eye(4))
-    inspector.log_candidates(make_grasps(30), np.eye(4))
-    inspector.log_plan(make_plan())
-    inspector.log_stage_times({"detect": 1.5, "total": 20.0})
+        logger.log_arm(*make_arm(step / 10))
+        logger.log_frame(make_frame(step / 10), np.eye(4))
+    logger.log_arm(*make_arm(2.0, ServoMode.BRAKING))
+    logger.log_observation(make_observation(2.0))
+    logger.log_box(box, np.array([1, 4]), np.eye(4))
+    logger.log_candidates(make_grasps(30), np.eye(4))
+    logger.log_plan(make_plan())
+    logger.log_stage_times({"detect": 1.5, "total": 20.0})
 
 
 def read_entities(path: Path) -> dict[str, int]:
@@ -120,7 +121,7 @@ def read_entities(path: Path) -> dict[str, int]:
 
 @pytest.fixture
 def held_worker(monkeypatch: pytest.MonkeyPatch):
-    """Keep every worker from drawing anything until the event is set."""
+    """Keep every worker from drawing until the event is set."""
     go = threading.Event()
     write_static = Recorder.write_static
 
@@ -135,22 +136,21 @@ def held_worker(monkeypatch: pytest.MonkeyPatch):
 
 def test_recording_holds_every_kind_of_entry(tmp_path: Path) -> None:
     path = tmp_path / "deep" / "episode.rrd"
-    inspector = RerunLogger(path)
-    log_everything(inspector)
-    inspector.close()
+    logger = RerunLogger(path)
+    log_everything(logger)
+    logger.close()
     rows = read_entities(path)
     wanted = {value for name, value in vars(blueprint).items() if name.isupper() and name not in ("TIMELINE",)}
     assert wanted - {blueprint.ARM} <= set(rows)
-    links = [name for name in rows if name.startswith(blueprint.ARM) and name.endswith("/mesh")]
-    assert len(links) == 9  # seven links, stator and mover
+    assert {f"{blueprint.ARM}/{link}" for link in LINKS} <= set(rows)
     assert rows[blueprint.POSITION] >= 21
-    assert inspector.lost == 0
+    assert logger.lost == 0
 
 
 def test_recording_holds_the_layout(tmp_path: Path) -> None:
     path = tmp_path / "episode.rrd"
-    inspector = RerunLogger(path)
-    inspector.close()
+    logger = RerunLogger(path)
+    logger.close()
     reader = RrdReader(path)
     (layout,) = reader.blueprints()
     entities = {chunk.entity_path for chunk in reader.stream(store=layout).to_chunks()}
@@ -159,64 +159,64 @@ def test_recording_holds_the_layout(tmp_path: Path) -> None:
 
 def test_times_are_those_of_the_messages(tmp_path: Path) -> None:
     path = tmp_path / "episode.rrd"
-    inspector = RerunLogger(path)
-    inspector.log_phase("look", 12.5)
-    inspector.log_stage_times({"total": 1.0})  # carries no time: takes the newest
-    inspector.close()
-    seen = {}
+    logger = RerunLogger(path)
+    logger.log_phase("look", 12.5)
+    logger.log_stage_times({"total": 1.0})  # carries no time: takes the newest
+    logger.close()
+    stamps = {}
     for chunk in RrdReader(path).stream().to_chunks():
         if blueprint.TIMELINE in chunk.timeline_names:
-            seen[chunk.entity_path.strip("/")] = chunk.to_record_batch().column(blueprint.TIMELINE)[0].value
-    assert seen[blueprint.PHASE] == seen[blueprint.STAGES] == 12_500_000_000
+            stamps[chunk.entity_path.strip("/")] = chunk.to_record_batch().column(blueprint.TIMELINE)[0].value
+    assert stamps[blueprint.PHASE] == stamps[blueprint.STAGES] == 12_500_000_000
 
 
 def test_full_queue_drops_oldest_frames_first_and_keeps_the_rest(tmp_path: Path, held_worker: threading.Event) -> None:
     path = tmp_path / "episode.rrd"
-    inspector = RerunLogger(path, max_frames=2, max_jobs=50)
+    logger = RerunLogger(path, max_frames=2, max_jobs=50)
     for step in range(40):
-        inspector.log_frame(make_frame(float(step)), np.eye(4))
-        inspector.log_phase(f"phase {step}", float(step))
-    assert inspector.frames_dropped == 38
-    assert inspector.lost == 0
+        logger.log_frame(make_frame(float(step)), np.eye(4))
+        logger.log_phase(f"phase {step}", float(step))
+    assert logger.frames_dropped == 38
+    assert logger.lost == 0
     held_worker.set()
-    inspector.close()
+    logger.close()
     rows = read_entities(path)
     assert rows[blueprint.COLOUR] == 2
     assert rows[blueprint.PHASE] == 40
 
 
-def test_caller_goes_on_when_the_worker_hangs(tmp_path: Path, held_worker: threading.Event) -> None:
-    inspector = RerunLogger(tmp_path / "episode.rrd", max_jobs=10)
+def test_caller_continues_while_the_worker_hangs(tmp_path: Path, held_worker: threading.Event) -> None:
+    logger = RerunLogger(tmp_path / "episode.rrd", max_jobs=10)
     for step in range(25):
-        inspector.log_phase("busy", float(step))
-    assert inspector.lost == 15
-    inspector.close(timeout_s=0.01)
+        logger.log_phase("busy", float(step))
+    assert logger.lost == 15
+    logger.close(timeout_s=0.01)
 
 
 def test_fault_in_a_drawing_ends_the_recording_not_the_caller(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    inspector = RerunLogger(tmp_path / "episode.rrd")
-    inspector.log_stage_times({"total": "no number"})  # pyright: ignore[reportArgumentType]
-    inspector.close()
+    logger = RerunLogger(tmp_path / "episode.rrd")
+    logger.log_stage_times({"total": "no number"})  # pyright: ignore[reportArgumentType]
+    logger.close()
     assert "the recording ends here" in caplog.text
 
 
-def test_faster_frames_than_wanted_are_thinned_by_their_stamps(tmp_path: Path) -> None:
+def test_frames_above_the_rate_are_thinned_by_their_stamps(tmp_path: Path) -> None:
     path = tmp_path / "episode.rrd"
-    inspector = RerunLogger(path, frame_rate_hz=5.0, max_frames=100)
+    logger = RerunLogger(path, frame_rate_hz=5.0, max_frames=100)
     for step in range(60):
-        inspector.log_frame(make_frame(step / 30), np.eye(4))
-    inspector.close()
+        logger.log_frame(make_frame(step / 30), np.eye(4))
+    logger.close()
     assert read_entities(path)[blueprint.COLOUR] == 10
-    assert inspector.frames_dropped == 0
+    assert logger.frames_dropped == 0
 
 
-def test_inspector_without_sinks_does_nothing() -> None:
+def test_logger_without_sinks_does_nothing() -> None:
     before = threading.active_count()
-    inspector = RerunLogger()
-    log_everything(inspector)
+    logger = RerunLogger()
+    log_everything(logger)
     assert threading.active_count() == before
-    inspector.close()
-    inspector.close()
+    logger.close()
+    logger.close()
 
 
 def free_port() -> int:
@@ -226,7 +226,7 @@ def free_port() -> int:
 
 
 def listening_addresses(port: int) -> set[str]:
-    """Return the local addresses (hex, as the kernel writes them) on which anybody listens on `port`."""
+    """Return the local addresses (hex, as the kernel writes them) of listeners on `port`."""
     found = set()
     for table in ("/proc/net/tcp", "/proc/net/tcp6"):
         for line in Path(table).read_text().splitlines()[1:]:
@@ -242,10 +242,10 @@ def test_live_view_listens_on_the_loopback_only(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     port = free_port()
-    inspector = RerunLogger(live=True, port=port)
+    logger = RerunLogger(live=True, port=port)
     with socket.create_connection(("127.0.0.1", port), timeout=20):
         assert listening_addresses(port) == {"0100007F"}
-    inspector.close()
+    logger.close()
 
 
 def test_taken_port_is_one_clear_error() -> None:
@@ -253,24 +253,25 @@ def test_taken_port_is_one_clear_error() -> None:
         other.bind(("127.0.0.1", 0))
         other.listen()
         port = other.getsockname()[1]
-        with pytest.raises(ViewerPortError, match=str(port)):
+        with raises(ViewerPortError, "viewer_port") as caught:
             RerunLogger(live=True, port=port)
+        assert str(port) in str(caught.value)
 
 
-def test_drawn_pivot_is_where_the_kinematics_put_it() -> None:
+def test_drawn_pivot_agrees_with_the_kinematics() -> None:
     q = np.random.default_rng(1).uniform(z1.Q_MIN, z1.Q_MAX, (20, 7))
     kinematics = Kinematics()
     wanted = [(kinematics.flange(row[:6]) @ z1.T_FLANGE_PIVOT)[:3, 3] for row in q]
-    assert np.allclose(RobotDrawing().pivot_path(q), wanted, atol=1e-9)
+    assert np.allclose(RobotView().pivot_path(q), wanted, atol=1e-9)
 
 
-def test_gripper_strip_ends_at_the_fingertips_on_either_side_of_the_grasp() -> None:
+def test_gripper_strip_ends_at_the_fingertips_on_both_sides_of_the_grasp() -> None:
     strip = gripper_strips(np.eye(4)[None], np.array([0.08]))[0]
     assert np.allclose(strip[[3, 6]], [[0, -0.04, 0], [0, 0.04, 0]])
-    assert strip[0, 2] == strip[:, 2].min() < 0  # the stem comes from behind: z is the approach
+    assert strip[0, 2] == strip[:, 2].min() < 0  # the stem is behind the grasp: z is the approach
 
 
-def test_viewer_opens_where_there_is_a_screen_and_stays_on_the_loopback(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_viewer_opens_on_a_screen_and_stays_on_the_loopback(monkeypatch: pytest.MonkeyPatch) -> None:
     started: list[list[str]] = []
     monkeypatch.setenv("DISPLAY", ":0")
     monkeypatch.setattr("subprocess.Popen", lambda command, **more: started.append(command))
@@ -282,9 +283,9 @@ def test_viewer_opens_where_there_is_a_screen_and_stays_on_the_loopback(monkeypa
 
 
 def test_drawn_meshes_are_the_robot_s_within_the_grid() -> None:
-    drawn = {path: entity for path, entity in RobotDrawing().draw_links() if isinstance(entity, rr.Mesh3D)}
+    drawn = {path: entity for path, entity in RobotView().draw_links() if isinstance(entity, rr.Mesh3D)}
     for stem, link in (("z1_Link01", "link01"), ("z1_GripperMover", "gripperMover")):
-        (mesh,) = (entity for path, entity in drawn.items() if path.endswith(f"{link}/mesh"))
+        mesh = drawn[f"{blueprint.ARM}/{link}"]
         assert mesh.vertex_positions is not None
         vertices = np.array(mesh.vertex_positions.as_arrow_array().to_pylist())
         whole = trimesh.load_mesh(z1.mesh_dir() / "collision" / f"{stem}.STL")
