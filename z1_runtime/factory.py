@@ -1,4 +1,4 @@
-"""Puts the stages of a decision together from a configuration."""
+"""Assembly of a grasp selector from a configuration."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from z1_runtime.tasks.grasp_selection import GraspSelector
 
 
 def make_grasp_selector(config: RuntimeConfig, T_flange_camera: np.ndarray = z1.T_FLANGE_CAMERA) -> GraspSelector:
-    """Return the decider that `config` describes.
+    """Return the grasp selector that `config` describes.
 
     Args:
-        config: which detector, generator, planner, and their numbers.
+        config: names of detector and generator, and all numbers.
         T_flange_camera: (4, 4) hand-eye transform.
 
     Raises:
@@ -31,7 +31,7 @@ def make_grasp_selector(config: RuntimeConfig, T_flange_camera: np.ndarray = z1.
     kinematics = Kinematics()
     detector = make_detector(config.detector, _yolo_config(config))
     if config.object_class and detector.classes:
-        labels_for(config.object_class, detector.classes)  # better refused now than before the object
+        labels_for(config.object_class, detector.classes)  # rejected now rather than before the object
     return GraspSelector(
         kinematics=kinematics,
         perception=Perception(config.perception, detector, T_flange_camera),

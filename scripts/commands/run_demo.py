@@ -149,6 +149,7 @@ def _assemble(
     from z1_runtime.factory import make_grasp_selector
     from z1_runtime.perception.extrinsics import find_extrinsics
     from z1_runtime.tasks.pick import PickTask
+    from z1_runtime.tasks.warm_up import warm_up_selector
     from z1_runtime.visualization.live_view import LiveView
     from z1_runtime.visualization.rerun_logger import RerunLogger
 
@@ -162,7 +163,7 @@ def _assemble(
     mount = find_extrinsics(scene.camera_serial(), config.calibration)
     console.print(f"  {'camera':<9} {mount.origin}", soft_wrap=True)
     decider = make_grasp_selector(runtime, mount.T_flange_camera)
-    decider.warm_up()
+    warm_up_selector(decider)
     inspector = RerunLogger(config.out / "episode.rrd", live=config.view)
     undo.callback(inspector.close)
     robot = undo.enter_context(remote_robot(process, config.bus) if process else lockstep_robot(scene))
@@ -174,7 +175,7 @@ def _assemble(
         console.print(f"  {phase.name:<9} {phase.duration_s:6.2f} s")
 
     pipeline = PickTask(
-        decider=decider,
+        selector=decider,
         arm=robot.arm,
         camera=robot.camera,
         clock=robot.clock,
@@ -216,21 +217,21 @@ def _identity(config: Config) -> dict[str, Any]:
 def summarise(robot: DemoRobot, record: PickResult, truth: GroundTruth) -> dict[str, Any]:
     """Return what summary.json holds of a pick that was executed."""
     status = robot.arm.status()
-    decision = record.decision
+    selection = record.selection
     return {
         "success": truth.lifted_m >= LIFTED_M,
         "lifted_m": round(truth.lifted_m, 6),
         "held": record.held,
-        "n_object_points": len(decision.observation.object_points),
-        "n_candidates": len(decision.candidates),
-        "n_after_mvb": len(decision.ranked.grasps),
-        "rank": decision.plan.rank,
+        "n_object_points": len(selection.observation.object_points),
+        "n_candidates": len(selection.grasps),
+        "n_after_mvb": len(selection.ranked.grasps),
+        "rank": selection.plan.rank,
         "rejections": record.rejections,
-        "width_m": round(decision.plan.width_m, 6),
+        "width_m": round(selection.plan.width_m, 6),
         "jaw": round(record.jaw, 6),
         "jaw_torque_nm": round(record.jaw_torque_nm, 6),
         "phase_s": {phase.name: round(phase.duration_s, 3) for phase in record.phases},
-        "stage_ms": {name: round(ms, 2) for name, ms in decision.stage_ms.items()},
+        "stage_ms": {name: round(ms, 2) for name, ms in selection.stage_ms.items()},
         "servo": _servo_figures(status),
         "zenoh": {"frame_ms_p50": round(robot.frame_ms(50), 3), "frame_ms_p99": round(robot.frame_ms(99), 3)},
     }

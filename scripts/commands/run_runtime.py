@@ -76,6 +76,7 @@ def _assemble(config: Config, arm: RemoteArm, camera: RemoteCamera, console: Con
     from z1_runtime.factory import make_grasp_selector
     from z1_runtime.perception.extrinsics import find_extrinsics
     from z1_runtime.tasks.pick import PickTask
+    from z1_runtime.tasks.warm_up import warm_up_selector
     from z1_runtime.visualization.live_view import LiveView
     from z1_runtime.visualization.rerun_logger import RerunLogger
 
@@ -86,13 +87,13 @@ def _assemble(config: Config, arm: RemoteArm, camera: RemoteCamera, console: Con
     mount = find_extrinsics(camera.wait_for_frame(runtime.frame_timeout_s).serial, config.calibration)
     console.print(f"  {'camera':<9} {mount.origin}", soft_wrap=True)
     decider = make_grasp_selector(runtime, mount.T_flange_camera)
-    decider.warm_up()
+    warm_up_selector(decider)
     inspector = RerunLogger(config.out / "episode.rrd" if config.out else None, live=config.view)
     undo.callback(inspector.close)
     if config.out or config.view:
         undo.enter_context(LiveView(camera, arm, inspector, mount.T_flange_camera))
     return PickTask(
-        decider=decider,
+        selector=decider,
         arm=arm,
         camera=camera,
         clock=WallClock(),

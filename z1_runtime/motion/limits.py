@@ -1,4 +1,4 @@
-"""How fast a motion may be, in joints and along straight lines."""
+"""Speed limits of motions, in joints and along straight lines."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from hal.base import z1
 from hal.base.errors import InvalidValueError
 
 DEFAULT_SPEED = 0.5
-"""Fraction of the arm's limits a motion uses unless told otherwise."""
+"""Fraction of the arm's limits that a motion uses by default."""
 
 # At full speed; the Z1's data sheet has no Cartesian figures, these are ours
 _FULL_LINEAR = (0.5, 2.0, 20.0)
@@ -24,7 +24,7 @@ def _scaled(limit: np.ndarray) -> Callable[[], np.ndarray]:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MotionLimits:
-    """How fast a motion may be; `MotionLimits()` is half of what the arm can, see `at_speed`.
+    """Limits of a motion; `MotionLimits()` is half of the arm's own, see `at_speed`.
 
     Raises:
         ValueError: a limit is not positive, not finite, or above `hal.base.z1`'s.
@@ -63,7 +63,7 @@ class MotionLimits:
                     raise InvalidValueError(f"{name} is {getattr(self, name)}; it must be positive and finite.")
 
     def scaled(self, factor: float) -> MotionLimits:
-        """Return limits `factor` times as high, where the arm's own do not end that.
+        """Return limits `factor` times as high, but at most the arm's own.
 
         Raises:
             ValueError: `factor` is not positive and finite.
