@@ -1,4 +1,4 @@
-"""Frozen values that the stages of a pick hand to each other."""
+"""Frozen values that the stages of a pick pass to each other."""
 
 from __future__ import annotations
 

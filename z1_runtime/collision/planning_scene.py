@@ -100,7 +100,7 @@ def _extend_to_table(points: np.ndarray, table: Plane, cut_off_m: float) -> np.n
         return points
     height = table.height_m(points)
     lowest = float(np.percentile(height, 1.0))
-    if lowest < cut_off_m:
+    if not lowest >= cut_off_m:  # NaN is left to the index, which rejects it
         return points
     rim = points[height < lowest + _RIM_M]
     drops = np.arange(0.0, lowest, _DROP_STEP_M)[:, None, None]

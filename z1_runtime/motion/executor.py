@@ -26,7 +26,7 @@ class MotionError(Z1Error, RuntimeError):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ExecutorConfig:
-    """Timing of the hand-over of trajectories."""
+    """Timing of the transfer of trajectories to the servo."""
 
     lead_s: float = 0.2
     """Duration of the motion that waits at the servo [s]; after the runtime's end the arm moves no longer than this."""

@@ -1,6 +1,6 @@
 """Timed motions of arm and gripper: jerk-limited, at rest at both ends, inside the limits, sampled at 500 Hz.
 
-A joint within `LIMIT_TOLERANCE_RAD` beyond a limit is clipped to it; further beyond is an error of the caller.
+A joint a hair beyond a limit is clipped to it, see `clip_joints`; further beyond is an error of the caller.
 """
 
 from __future__ import annotations
@@ -15,11 +15,9 @@ from scipy.interpolate import make_interp_spline
 from hal.base import transforms, z1
 from hal.base.errors import InvalidValueError, Z1Error
 from z1_runtime.geometry.kinematics import POSITION_TOLERANCE_M, ROTATION_TOLERANCE_RAD, IkFailure, Kinematics
-from z1_runtime.motion.limits import MotionLimits
+from z1_runtime.motion.limits import MotionLimits, clip_joints
 from z1_runtime.types import JointTrajectory
 
-LIMIT_TOLERANCE_RAD = 0.005
-"""A measured joint at rest at its limit, or a planned one, may be this far beyond it [rad]."""
 _ROUNDING_RAD = 1e-9
 
 _OVERSHOOT = 1e-6  # of the length; Ruckig's rounding
@@ -50,7 +48,7 @@ class PathFailure(Z1Error):
 
 
 def hold(q: np.ndarray, duration_s: float) -> JointTrajectory:
-    """Stay at `q` (7,) for `duration_s` [s], rounded up to whole control periods, at least one.
+    """Hold `q` (7,) for `duration_s` [s], rounded up to whole control periods, at least one.
 
     Raises:
         ValueError: `q` is not a joint vector inside the limits, or `duration_s` is negative or not finite.
@@ -102,7 +100,7 @@ def joint_path(qs: np.ndarray, limits: MotionLimits | None = None) -> JointTraje
 
 
 def gripper_move(q: np.ndarray, jaw_goal: float, limits: MotionLimits | None = None) -> JointTrajectory:
-    """Move the gripper of `q` (7,) to `jaw_goal` [rad] while the arm stands still.
+    """Move the gripper of `q` (7,) to `jaw_goal` [rad] while the arm is at rest.
 
     Raises:
         ValueError: `q` or `jaw_goal` is outside the limits, or not finite.
@@ -270,22 +268,6 @@ def _time_along(
 
 
 # --- Checks -----------------------------------------------------------------------------------------------
-
-
-def clip_joints(q: np.ndarray, name: str) -> np.ndarray:
-    """Return `q` (7,) inside the joint limits, where it is at most `LIMIT_TOLERANCE_RAD` beyond them.
-
-    Raises:
-        ValueError: it is further beyond, not finite, or no joint vector; the message calls it `name`.
-    """
-    q = np.array(q, dtype=np.float64)
-    if q.shape != (z1.N_JOINTS,):
-        raise InvalidValueError(f"{name} has shape {q.shape}; a joint vector is ({z1.N_JOINTS},).", code="shape")
-    for joint, value, low, high in zip(z1.JOINT_NAMES, q, z1.Q_MIN, z1.Q_MAX, strict=True):
-        if not low - LIMIT_TOLERANCE_RAD <= value <= high + LIMIT_TOLERANCE_RAD:
-            message = f"{name}: {joint} is {value:.4f} rad; allowed is {low:.4f} to {high:.4f} rad."
-            raise InvalidValueError(message, code="joint_limit")
-    return np.clip(q, z1.Q_MIN, z1.Q_MAX)
 
 
 def _check_start(T_from: np.ndarray, T_start: np.ndarray) -> None:
