@@ -118,7 +118,7 @@ def test_a_board_out_of_reach_is_told_with_the_reasons_counted(kinematics, check
 def test_what_stands_on_the_table_is_kept_away_from(kinematics, checker):
     box = (np.array([0.50, -0.20, 0.0]), np.array([0.60, 0.20, 0.30]))
     walled = look_around(kinematics, frame_from_home(kinematics, box), HOME)
-    assert len(walled.scene_index) > 100 and len(checker.scene_index) == 0
+    assert len(walled.scene.scene_index) > 100 and len(checker.scene.scene_index) == 0
     T_pivot = np.eye(4)
     T_pivot[:3, 3] = [0.50, 0.0, 0.25]  # the tips reach 0.1 m beyond: into the box
     q = np.append(kinematics.best(T_pivot).q, 0.0)
