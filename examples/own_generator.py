@@ -20,7 +20,7 @@ def main() -> bool:
     """Return whether the jaws hold the object."""
     with Robot.simulate("box", generator=BestAntipodal()) as robot:
         result = robot.pick()
-    print(f"held: {result.held}, of {len(result.decision.candidates)} candidates")
+    print(f"held: {result.held}, of {len(result.selection.grasps)} candidates")
     return result.held
 
 

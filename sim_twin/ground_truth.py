@@ -98,7 +98,7 @@ class GroundTruthClient:
             HalTimeoutError: no twin answers, for instance because the HAL drives a real arm.
         """
         try:
-            content = msgpack.unpackb(self._link.ask(_TRUTH))
+            content = msgpack.unpackb(self._link.request(_TRUTH))
         except HalTimeoutError as error:
             raise HalTimeoutError(
                 f"the twin does not answer; only a simulated HAL knows the truth ({error})"

@@ -57,10 +57,10 @@ class RuntimeConfig:
     """How many faces nearest to the camera a grasp may approach (the paper's k)."""
     alpha: float = 0.85
     """Weight of the alignment against the generator's score (the paper's α), among grasps that are worth the same to
-    arm and gripper (`planner.ability`)."""
+    arm and gripper (`planner.reachability`)."""
     scoring: str = ""
     """A file of `./z1 tune`, whose box, faces, weights and thresholds then stand for `box_method`, `k_faces`, `alpha`
-    and, if it holds a head, for the weights of `planner.ability`; empty = those set here."""
+    and, if it holds a head, for the weights of `planner.reachability`; empty = those set here."""
     speed: float = 0.5
     """Fraction of the arm's speed, acceleration and jerk limits that motions use, in (0, 1]."""
     jaw_home: float = -1.0

@@ -1,4 +1,4 @@
-"""Puts the stages of a decision together from a configuration."""
+"""Assembly of a grasp selector from a configuration."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ def make_grasp_selector(
     detector: Detector | None = None,
     generator: GraspGenerator | None = None,
 ) -> GraspSelector:
-    """Return the decider that `config` describes.
+    """Return the grasp selector that `config` describes.
 
     Args:
-        config: which detector, generator, planner, and their numbers.
+        config: names of detector and generator, and all numbers.
         T_flange_camera: (4, 4) hand-eye transform.
         detector: used in place of the configured one.
         generator: used in place of the configured one.

@@ -195,10 +195,11 @@ class Robot:
         self.arm.claim(self._owner)
         q_start = np.clip(self.arm.status().q_command, z1.Q_MIN, z1.Q_MAX)
         motion = joint_move(q_start, self._goal_joints(goal, q_start, jaw), MotionLimits.at_speed(self.config.speed))
-        if violation := self._guard.refusal(motion.q, q_start):
+        if violation := self._guard.find_violation(motion.q, q_start):
             raise GuardError(
-                f"robot: the motion is not allowed ({100 * violation[0] / len(motion.q):.0f} % along it, the arm "
-                f"{violation[1]}). Choose another goal, or go there by way of another posture."
+                f"robot: the motion is not allowed ({100 * violation.index / len(motion.q):.0f} % along it, "
+                f"{violation.text}). Choose another goal, or go there by way of another posture.",
+                code=violation.code,
             )
         self._executor.execute(motion)
         return self._executor.settle()
@@ -244,11 +245,11 @@ class Robot:
         selector = self._load_selector(config)
         self.arm.claim(self._owner)
         task = PickTask(
-            decider=selector,
+            selector=selector,
             arm=self.arm,
             camera=self.camera,
             clock=self.clock,
-            inspector=self.logger,
+            logger=self.logger,
             config=config,
             on_phase=self._on_phase,
         )
@@ -296,12 +297,13 @@ class Robot:
     def _load_selector(self, config: RuntimeConfig) -> GraspSelector:
         """Return the selector for `config`, which differs from `self.config` in class and attempts only."""
         from z1_runtime.factory import check_object_class, make_grasp_selector
+        from z1_runtime.tasks.warm_up import warm_up_selector
 
         if self._selector is None:
             self._selector = make_grasp_selector(
                 config, self.extrinsics.T_flange_camera, detector=self._detector, generator=self._generator
             )
-            self._selector.warm_up()
+            warm_up_selector(self._selector)
         elif self._selector.config != config:
             check_object_class(config, self._selector.perception.detector)
             self._selector.config = config

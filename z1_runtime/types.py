@@ -1,9 +1,10 @@
-"""What the stages of a pick hand to each other; each is made once and never changed."""
+"""Frozen values that the stages of a pick pass to each other."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from enum import StrEnum
 from typing import Literal
 
 import numpy as np
@@ -12,7 +13,7 @@ from hal.base.messages import RgbdFrame
 from models.types import Detection
 
 IkMethod = Literal["analytic", "least_squares"]
-"""How joints were found: exactly, or within 2 mm and 1° of the pose."""
+"""Solver of the joints: exact, or within 2 mm and 1° of the pose."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -31,7 +32,7 @@ class Plane:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Observation:
-    """What perception makes of one frame. Clouds and plane are in the camera's optical frame [m]."""
+    """One object and its surroundings in one frame. Clouds and plane are in the camera's optical frame [m]."""
 
     frame: RgbdFrame
     T_base_camera: np.ndarray
@@ -39,12 +40,12 @@ class Observation:
     detection: Detection
     """The object that was chosen."""
     object_points: np.ndarray
-    """(N, 3) the object, outliers and table taken off."""
+    """(N, 3) the object, without outliers and table."""
     scene_points: np.ndarray
-    """(M, 3) everything else that was seen: the table, neighbours, walls; not the object."""
+    """(M, 3) everything else that was observed: the table, neighbours, walls; not the object."""
     table: Plane
     occluded_points: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
-    """(K, 3) where the object may go on, but its sight was blocked; see `z1_runtime.perception.occlusion`."""
+    """(K, 3) where the object may continue behind an occlusion; see `z1_runtime.perception.occlusion`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -60,10 +61,10 @@ class JointTrajectory:
 
     @property
     def duration_s(self) -> float:
-        """How long it takes [s]."""
+        """Time of the last sample [s]."""
         return float(self.t_s[-1])
 
-    def pieces(self, length_s: float) -> Iterator[slice]:
+    def split(self, length_s: float) -> Iterator[slice]:
         """Yield index ranges that each span about `length_s` [s], in order, covering everything once."""
         start = 0
         while start < len(self.t_s):
@@ -72,44 +73,80 @@ class JointTrajectory:
             start = stop
 
 
+class RejectionReason(StrEnum):
+    """Reason for which a candidate is not taken; the values are column names of stored episodes.
+
+    Declared by progress: of several rejections of one candidate, the latest in this order is reported.
+    """
+
+    WIDTH = "width"
+    IK = "ik"
+    PATH = "path"
+    TABLE = "table"
+    SELF = "self"
+    OBJECT = "object"
+    SCENE = "scene"
+
+    @property
+    def progress(self) -> int:
+        """Index in the order of declaration."""
+        return tuple(RejectionReason).index(self)
+
+
+class PlanningStage(StrEnum):
+    """Step of the planning at which a candidate is rejected."""
+
+    FIT = "fit"
+    """Gripper fitted to the object's width."""
+    GRASP = "grasp"
+    """Opened gripper at the grasp."""
+    IK = "ik"
+    """Joints of pre-grasp, grasp and lifted pose."""
+    TRANSFER = "transfer"
+    APPROACH = "approach"
+    CLOSE = "close"
+    LIFT = "lift"
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Rejection:
-    """Why a candidate was not taken."""
+    """One candidate, posture or motion that is not taken, from the check to the report."""
 
-    rank: int
-    """Place of the candidate in the ranking, from 0."""
-    reason: str
-    """One word a table can count: `ik`, `path`, `table`, `scene`, `self`, `object`, `width`."""
+    reason: RejectionReason
+    stage: PlanningStage
     detail: str
-    """The sentence a person reads, with the figures."""
+    """A sentence with the figures."""
+    rank: int | None = None
+    """Index of the candidate in the ranking, from 0; None for what is no candidate, as in a calibration."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class GraspPlan:
-    """One grasp the arm can do, with the whole motion."""
+    """One feasible grasp with its whole motion."""
 
     rank: int
-    """Place of the executed candidate in the ranking, from 0."""
+    """Index of the executed candidate in the ranking, from 0."""
     T_base_grasp: np.ndarray
     """(4, 4) the candidate, paper's grasp frame (z approach, y opening)."""
     width_m: float
     """Object width between the jaws [m]."""
     T_base_pivot: np.ndarray
-    """(4, 4) gripper pivot at the grasp, where the joints really put it."""
+    """(4, 4) gripper pivot at the grasp, as the planned joints reach it."""
     jaw_open: float
-    """Mover angle while approaching [rad]."""
+    """Jaw angle while approaching [rad]."""
     jaw_contact: float
-    """Mover angle at which the moving jaw should touch [rad]."""
+    """Jaw angle at which the moving jaw should touch [rad]."""
     transfer: JointTrajectory
-    """From where the arm is to the pre-grasp, jaw opening on the way."""
+    """From the arm's present posture to the pre-grasp, the jaw opening meanwhile."""
     approach: JointTrajectory
     """Straight from the pre-grasp to the grasp."""
     close: JointTrajectory
-    """The jaw from open to past contact, the hand turning the other way until both jaws press; then the jaw alone:
+    """The jaw from open to past contact, the gripper turning the other way until both jaws press; then the jaw alone:
     the servo's stiffness makes the squeeze."""
     lift: JointTrajectory
-    """Straight up with the object from where the jaws closed, jaw command closed."""
+    """Straight up with the object, jaw command closed."""
     rejections: tuple[Rejection, ...]
-    """Why the other candidates tried were refused: those before this one, and after least squares all others."""
+    """One for each candidate that was tried and not taken: those before this one, and after least squares all
+    others."""
     ik_method: IkMethod = "analytic"
-    """How its joints were found; `least_squares` only after all candidates were refused with analytic ones."""
+    """Solver of its joints; `least_squares` only after all candidates were rejected with analytic ones."""

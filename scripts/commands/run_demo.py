@@ -34,6 +34,7 @@ if TYPE_CHECKING:  # planner and viewer take seconds to load, which the HAL's ow
     from z1_runtime.config import RuntimeConfig
     from z1_runtime.robot import Robot
     from z1_runtime.tasks.pick import PickResult
+    from z1_runtime.tasks.warm_up import warm_up_selector
 
 WIRED_LEAD_S = 0.5
 """Motion queued at the servo when the twin runs in its own processes [s]; they delay a chunk by up to 0.1 s on one
@@ -127,7 +128,7 @@ def _open_robot(config: Config, process: HalProcess | None, console: Console) ->
     extrinsics = find_extrinsics(scene.camera_serial(), config.calibration)
     console.print(f"  {'camera':<9} {extrinsics.origin}", soft_wrap=True)
     selector = make_grasp_selector(runtime, extrinsics.T_flange_camera)
-    selector.warm_up()
+    warm_up_selector(selector)
     if process is not None:  # last: the HAL process starts while the planner loads
         process.wait_ready()
     robot = Robot(
@@ -192,21 +193,21 @@ def _identity(scene: SceneOptions) -> dict[str, Any]:
 
 def summarise(robot: Robot, result: PickResult, truth: GroundTruth) -> dict[str, Any]:
     """Return the content of summary.json for an executed pick."""
-    decision = result.decision
+    selection = result.selection
     return {
         "success": truth.lifted_m >= LIFTED_M,
         "lifted_m": round(truth.lifted_m, 6),
         "held": result.held,
-        "n_object_points": len(decision.observation.object_points),
-        "n_candidates": len(decision.candidates),
-        "n_after_mvb": len(decision.ranked.grasps),
-        "rank": decision.plan.rank,
+        "n_object_points": len(selection.observation.object_points),
+        "n_candidates": len(selection.grasps),
+        "n_after_mvb": len(selection.ranked.grasps),
+        "rank": selection.plan.rank,
         "rejections": result.rejections,
-        "width_m": round(decision.plan.width_m, 6),
+        "width_m": round(selection.plan.width_m, 6),
         "jaw": round(result.jaw, 6),
         "jaw_torque_nm": round(result.jaw_torque_nm, 6),
         "phase_s": {phase.name: round(phase.duration_s, 3) for phase in result.phases},
-        "stage_ms": {name: round(ms, 2) for name, ms in decision.stage_ms.items()},
+        "stage_ms": {name: round(ms, 2) for name, ms in selection.stage_ms.items()},
         "servo": _servo_figures(robot.arm.status()),
         "zenoh": {f"frame_ms_p{percent}": round(_frame_ms(robot, percent), 3) for percent in (50, 99)},
     }

@@ -19,16 +19,18 @@ from PIL import Image
 
 from hal.base import z1
 from scripts.docs.wrist_overlay import Layers, draw_caption, draw_mask, draw_overlay
-from scripts.support.demo_robot import DemoRobot, lockstep_robot
+from sim_twin.backends import make_rig
 from sim_twin.camera import d405
 from sim_twin.camera.external_view import draw_outside
 from sim_twin.camera.render import make_renderer
 from sim_twin.clock import TwinClock
 from sim_twin.model.scene import SceneConfig, build_model
 from z1_runtime.config import load_config
+from z1_runtime.devices import Devices, connect_rig
 from z1_runtime.factory import make_grasp_selector
 from z1_runtime.geometry.kinematics import Kinematics
 from z1_runtime.tasks.pick import PickResult, PickTask
+from z1_runtime.tasks.warm_up import warm_up_selector
 from z1_runtime.visualization.rerun_logger import RerunLogger
 
 _SIZE = (480, 360)
@@ -82,18 +84,18 @@ def record_pick(scene: SceneConfig, config: Config) -> tuple[PickResult, list[Sn
     """Return the result of one pick in lock-step, and the twin's states `rate_hz` times a second."""
     runtime = replace(load_config(), seed=config.seed, object_class=config.object)
     selector = make_grasp_selector(runtime)
-    selector.warm_up()
+    warm_up_selector(selector)
     snapshots: list[Snapshot] = []
-    with lockstep_robot(scene) as robot:
+    with connect_rig(make_rig(scene, lockstep=True)) as robot:
         assert isinstance(robot.clock, TwinClock)
         robot.clock.call_every_tick(lambda: _record(robot, snapshots, 1.0 / config.rate_hz))
         robot.arm.claim("recording")
         task = PickTask(
-            decider=selector,
+            selector=selector,
             arm=robot.arm,
             camera=robot.camera,
             clock=robot.clock,
-            inspector=RerunLogger(),
+            logger=RerunLogger(),
             config=runtime,
         )
         return task.pick(), snapshots
@@ -104,7 +106,7 @@ def draw_frames(scene: SceneConfig, result: PickResult, snapshots: Sequence[Snap
     model = build_model(scene)
     data = mujoco.MjData(model)
     renderer = make_renderer(model, d405.INTRINSICS)
-    kinematics, selection = Kinematics(), result.decision
+    kinematics, selection = Kinematics(), result.selection
     transfer_s = next(phase.start_s for phase in result.phases if phase.name == "transfer")
     frames: list[Image.Image] = []
     try:
@@ -143,18 +145,18 @@ def write_webp(frames: Sequence[Image.Image], config: Config) -> None:
     )
 
 
-def _record(robot: DemoRobot, snapshots: list[Snapshot], period_s: float) -> None:
+def _record(robot: Devices, snapshots: list[Snapshot], period_s: float) -> None:
     t_s = robot.clock.now_s()
     if not snapshots or t_s >= snapshots[-1].t_s + period_s - 1e-6:
-        snapshots.append(Snapshot(t_s=t_s, qpos=robot.truth().qpos.copy(), q=robot.arm.read_state().q))
+        snapshots.append(Snapshot(t_s=t_s, qpos=robot.world.data.qpos.copy(), q=robot.arm.read_state().q))
 
 
 def _decision_frames(outside: np.ndarray, result: PickResult) -> list[Image.Image]:
     """Return the results of the stages on the frame that they were computed from."""
-    selection = result.decision
+    selection = result.selection
     observation, T = selection.observation, selection.observation.T_base_camera
     colour, found = observation.frame.colour, observation.detection
-    n_kept, n_all = len(selection.ranked), len(selection.candidates)
+    n_kept, n_all = len(selection.ranked), len(selection.grasps)
     stages = [
         ("detect", draw_mask(colour, found.mask, found.box_px), f"detect: {found.label} {found.confidence:.2f}"),
         ("cloud", _overlay(colour, T, result, Layers(points=True)), f"cloud: {len(observation.object_points)} points"),
@@ -166,7 +168,7 @@ def _decision_frames(outside: np.ndarray, result: PickResult) -> list[Image.Imag
 
 
 def _overlay(colour: np.ndarray, T_base_camera: np.ndarray, result: PickResult, layers: Layers) -> np.ndarray:
-    return draw_overlay(colour, T_base_camera, d405.INTRINSICS, result.decision, layers)
+    return draw_overlay(colour, T_base_camera, d405.INTRINSICS, result.selection, layers)
 
 
 def _phase_at(result: PickResult, t_s: float) -> str:

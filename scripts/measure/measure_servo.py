@@ -188,7 +188,7 @@ class _TimedServo(Servo):
         watch = Stopwatch()
         super().tick()
         self.cost_ms[i] = watch.lap_ms()
-        self.played_s[i] = 0.0 if self._snapshot is None else self._snapshot.time_s
+        self.played_s[i] = 0.0 if self._snapshot is None else self._snapshot.trajectory_time_s
         self.count += 1
 
 

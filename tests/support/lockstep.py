@@ -1,4 +1,4 @@
-"""A mock arm under the real servo on a clock that ticks it while somebody sleeps: seconds of motion in milliseconds."""
+"""A mock arm under the real servo on a clock that ticks it during every sleep: seconds of motion in milliseconds."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class TickingClock(ManualClock):
 
 
 class Bench:
-    """A connected arm whose lease is held; it stands at `q` (7,) [rad]."""
+    """A connected arm whose lease is held; its joints start at `q` (7,) [rad]."""
 
     def __init__(self, q: np.ndarray) -> None:
         self.clock = TickingClock()
@@ -42,11 +42,11 @@ class Bench:
         due_s = self.clock.now_s() + t_s
         pending = [call]
 
-        def look() -> None:
+        def call_when_due() -> None:
             if pending and self.clock.now_s() >= due_s:
                 pending.pop()()
 
-        self.clock.each_tick.append(look)
+        self.clock.each_tick.append(call_when_due)
 
     def wait(self, seconds: float) -> None:
         self.clock.sleep_until(self.clock.now_s() + seconds)

@@ -1,4 +1,4 @@
-"""Analytic scenes seen from home: ray-cast table, boxes and cylinders, with the depth errors of a D405."""
+"""Analytic scenes observed from home: ray-cast table, boxes and cylinders, with the depth errors of a D405."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def T_base_camera() -> np.ndarray:
 
 @dataclass(frozen=True)
 class Box:
-    """Stands on its centre x, y; turned about the vertical; `bottom_m` above the table."""
+    """Upright box at its centre x, y, turned about the vertical, `bottom_m` above the table."""
 
     x: float
     y: float
@@ -49,7 +49,7 @@ class Box:
 
 @dataclass(frozen=True)
 class Cylinder:
-    """Stands upright on the table."""
+    """Upright cylinder on the table."""
 
     x: float
     y: float
@@ -93,7 +93,7 @@ def cast(
 
 @cache
 def gripper_depth(jaw: float) -> np.ndarray:
-    """Return depth (480, 640) [m] of the gripper alone, its meshes with the mover at `jaw` [rad]; inf beside it."""
+    """Return depth (480, 640) [m] of the gripper alone, its moving jaw at `jaw` [rad]; inf elsewhere."""
     import trimesh
 
     T_camera_pivot = np.linalg.inv(T_FLANGE_CAMERA) @ T_FLANGE_PIVOT
@@ -107,8 +107,8 @@ def gripper_depth(jaw: float) -> np.ndarray:
         x, y, z = (T_camera_pivot @ T @ np.column_stack([points, np.ones(len(points))]).T)[:3]
         u = np.rint(INTRINSICS.fx * x / z + INTRINSICS.cx).astype(int)
         v = np.rint(INTRINSICS.fy * y / z + INTRINSICS.cy).astype(int)
-        seen = (z > 0.05) & (u >= 0) & (u < INTRINSICS.width) & (v >= 0) & (v < INTRINSICS.height)
-        np.minimum.at(depth, (v[seen], u[seen]), z[seen])
+        visible = (z > 0.05) & (u >= 0) & (u < INTRINSICS.width) & (v >= 0) & (v < INTRINSICS.height)
+        np.minimum.at(depth, (v[visible], u[visible]), z[visible])
     return depth
 
 
@@ -139,7 +139,7 @@ def d405(depth: np.ndarray, seed: int, noise_px: float = 0.08) -> np.ndarray:
 
     columns = np.arange(depth.shape[1])
     for row in range(depth.shape[0]):
-        # A pixel is unseen by the right imager if something further right projects to its left there.
+        # A pixel is occluded for the right imager if something further right projects to its left there
         right = columns - disparity[row]
         covered = np.minimum.accumulate(right[::-1])[::-1]
         z[row, (right > covered + 0.5) | (right < 0)] = 0.0
@@ -158,12 +158,12 @@ def frame_of(depth: np.ndarray, truth: np.ndarray | None = None) -> RgbdFrame:
 
 
 def noisy_frame(objects: Sequence[Box | Cylinder], seed: int = 0, target: int = 0, **table: float) -> RgbdFrame:
-    """Return objects seen by a D405; `target` is the one in the truth mask."""
+    """Return a D405's frame of objects; `target` is the one in the ground-truth mask."""
     depth, which = cast(objects, **table)
     return frame_of(d405(depth, seed), which == target)
 
 
 def truth(frame: RgbdFrame) -> np.ndarray:
-    """Return the truth mask of a frame that has one."""
+    """Return the ground-truth mask of a frame that has one."""
     assert frame.ground_truth_mask is not None
     return frame.ground_truth_mask

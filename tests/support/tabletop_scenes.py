@@ -1,4 +1,4 @@
-"""Analytic scenes for the collision and planner tests: a standing cylinder on a table, seen from home."""
+"""Analytic scenes for the collision and planner tests: an upright cylinder on a table, observed from home."""
 
 from __future__ import annotations
 
@@ -8,8 +8,14 @@ from hal.base import z1
 from hal.base.messages import Intrinsics, RgbdFrame
 from hal.base.transforms import inverse
 from models.types import Detection, GraspSet
+from z1_runtime.collision.collision_config import CollisionConfig
+from z1_runtime.collision.planning_scene import PlanningScene
+from z1_runtime.collision.scene_collision import CollisionChecker
 from z1_runtime.geometry.gripper_geometry import BeakConfig
 from z1_runtime.geometry.kinematics import Kinematics
+from z1_runtime.grasping.beak_gripper import BeakGripper
+from z1_runtime.grasping.grasp_candidates import EARLY_EXIT_CHUNK, GraspCandidates
+from z1_runtime.planning.planner_config import PlannerConfig
 from z1_runtime.types import Observation, Plane
 
 Q_START = np.append(z1.Q_HOME, -1.0)
@@ -26,7 +32,7 @@ def moved(T: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def cylinder(x: float, y: float, eye: np.ndarray, radius: float = RADIUS_M, height: float = HEIGHT_M) -> np.ndarray:
-    """Return the points of an upright cylinder that `eye` (3,) sees, base frame."""
+    """Return the points of an upright cylinder that are visible from `eye` (3,), base frame."""
     rng = np.random.default_rng(0)
     angle, z = rng.uniform(0.0, 2.0 * np.pi, N_POINTS), rng.uniform(0.008, height, N_POINTS)
     outward = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(N_POINTS)])
@@ -80,3 +86,27 @@ def in_camera(T_base_camera: np.ndarray, grasps: list[np.ndarray], width_m: floa
         scores=np.ones(len(grasps)),
         widths_m=np.full(len(grasps), width_m),
     )
+
+
+def make_checker(
+    kinematics: Kinematics,
+    observation: Observation,
+    q: np.ndarray | None = Q_START,
+    config: CollisionConfig | None = None,
+) -> CollisionChecker:
+    """Return the collision checks in the scene of `observation`, taken at joints `q` (7,)."""
+    return CollisionChecker(kinematics, PlanningScene.from_observation(observation, q, kinematics, config))
+
+
+def make_candidates(
+    kinematics: Kinematics,
+    grasps: GraspSet,
+    observation: Observation,
+    config: PlannerConfig | None = None,
+    chunk: int | None = EARLY_EXIT_CHUNK,
+) -> GraspCandidates:
+    """Return `grasps` (camera frame) as candidates in the scene of `observation`."""
+    config = config or PlannerConfig()
+    checker = make_checker(kinematics, observation, config=config.collision)
+    gripper = BeakGripper(config.gripper)
+    return GraspCandidates.from_grasps(grasps, checker, gripper, fallback_width_m=config.fallback_width_m, chunk=chunk)

@@ -204,7 +204,7 @@ def test_pick_with_a_given_detector_and_generator_holds_the_box_and_repeats() ->
     first, second = results
     assert first.held
     assert (first.jaw, first.jaw_torque_nm) == (second.jaw, second.jaw_torque_nm)
-    np.testing.assert_array_equal(first.decision.plan.lift.q, second.decision.plan.lift.q)
+    np.testing.assert_array_equal(first.selection.plan.lift.q, second.selection.plan.lift.q)
 
 
 class LabelledDetector(GroundTruthDetector):

@@ -17,7 +17,9 @@ from hal.base.errors import InvalidValueError, Z1Error
 from hal.base.messages import Intrinsics, RgbdFrame
 from hal.base.transforms import inverse, make_pose, transform_points
 from models.types import Detection
-from z1_runtime.collision.scene_collision import CollisionChecker, CollisionConfig
+from z1_runtime.collision.collision_config import CollisionConfig
+from z1_runtime.collision.planning_scene import PlanningScene
+from z1_runtime.collision.scene_collision import CollisionChecker
 from z1_runtime.geometry.kinematics import Kinematics
 from z1_runtime.motion.trajectory import MotionLimits, joint_path
 from z1_runtime.perception.point_cloud import back_project, continuous_pixels, valid_pixels
@@ -127,7 +129,7 @@ def _checker(  # noqa: PLR0917 - robot, frame, pose of the camera, then what fol
         scene_points=obstacles,
         table=expected_table(T_base_camera),
     )
-    return CollisionChecker(kinematics, observation, q, config)
+    return CollisionChecker(kinematics, PlanningScene.from_observation(observation, q, kinematics, config))
 
 
 def find_viewpoints(

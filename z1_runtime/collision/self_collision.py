@@ -1,4 +1,4 @@
-"""Says whether the arm's links, which are capsules here, hit the table or the arm itself."""
+"""Contacts of the arm, whose links are capsules, with the table and with itself."""
 
 from __future__ import annotations
 
@@ -13,36 +13,26 @@ from hal.base.z1_shape import CAPSULE_PAIRS, CAPSULES, GRIPPER_OBSTACLES, TABLE_
 from hal.servo.guard_kernels import segment_distance, squared_distance
 from z1_runtime.geometry.gripper_mesh import gripper_shape
 from z1_runtime.geometry.kinematics import Kinematics
-from z1_runtime.types import Plane
+from z1_runtime.types import Plane, PlanningStage, Rejection, RejectionReason
 
 MAY_MEET_SCENE = np.array([c.link in TABLE_LINKS for c in CAPSULES])
-"""(C,) which capsules move about enough to meet the table or what stands on it."""
+"""(C,) capsules that can reach the table or the objects on it."""
 _OBSTACLES = np.array([c.link in GRIPPER_OBSTACLES for c in CAPSULES])
 _RADII = np.array([c.radius_m for c in CAPSULES])
 _ENDS = np.array([[c.start, c.end] for c in CAPSULES])
-_SELF_VERTICES = 400  # heads of the gripper's points that are tried against the capsules, which have 10 mm to spare
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Problem:
-    """What is hit first."""
-
-    reason: str
-    """`table`, `scene`, `self` or `object`; a candidate that does not even fit the beak has `width`."""
-    detail: str
-    """A sentence with the figures."""
+_SELF_VERTICES = 400  # first of the gripper's points, tried against capsules that exceed their links by up to 10 mm
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ArmPoses:
-    """Where the arm's parts are at N joint vectors, all in base."""
+    """Poses of the arm's parts at N joint vectors, all in base."""
 
     links: np.ndarray
     """(N, C, 4, 4) T_base_link of every capsule's link."""
     pivots: np.ndarray
     """(N, 4, 4) T_base_pivot."""
-    movers: np.ndarray
-    """(N, 4, 4) T_base_mover."""
+    jaws: np.ndarray
+    """(N, 4, 4) T_base_jaw of the moving jaw."""
 
     @classmethod
     def at(cls, kinematics: Kinematics, q: np.ndarray) -> ArmPoses:
@@ -56,13 +46,14 @@ class ArmPoses:
         return cls(links, pivots, pivots @ moving_jaw_pose(q[:, -1]))
 
 
-def first_arm_problem(poses: ArmPoses, table: Plane, link_margin_m: float) -> Problem | None:
-    """Return what the links hit at any of the poses, the table (base frame) or the arm itself, or None.
+def check_arm(poses: ArmPoses, table: Plane, link_margin_m: float, stage: PlanningStage) -> Rejection | None:
+    """Return the first contact of the links, at any of the poses, with the table or the arm itself, or None.
 
     Args:
         poses: of the arm.
         table: in the base frame.
-        link_margin_m: least height of a link over it [m].
+        link_margin_m: minimum height of a link over it [m].
+        stage: step of the pick that the rejection names.
     """
     links = poses.links
     ends = np.einsum("ncij,cej->ncei", links[..., :3, :3], _ENDS) + links[:, :, None, :3, 3]  # (N, C, 2, 3)
@@ -70,27 +61,28 @@ def first_arm_problem(poses: ArmPoses, table: Plane, link_margin_m: float) -> Pr
     heights[:, ~MAY_MEET_SCENE] = np.inf
     if (heights < link_margin_m).any():
         n, c = np.unravel_index(heights.argmin(), heights.shape)
-        return Problem(
-            reason="table",
-            detail=f"{CAPSULES[c].link} would be {heights[n, c] * 1e3:.0f} mm above the table; "
-            f"allowed is {link_margin_m * 1e3:.0f} mm.",
+        detail = (
+            f"{CAPSULES[c].link} would be {heights[n, c] * 1e3:.0f} mm above the table; "
+            f"allowed is {link_margin_m * 1e3:.0f} mm."
         )
+        return Rejection(reason=RejectionReason.TABLE, stage=stage, detail=detail)
     one, other = _first_capsule_pair(ends, _RADII, CAPSULE_PAIRS)
     if one >= 0:
-        return Problem(reason="self", detail=f"{CAPSULES[one].link} would hit {CAPSULES[other].link}.")
+        detail = f"{CAPSULES[one].link} would hit {CAPSULES[other].link}."
+        return Rejection(reason=RejectionReason.SELF, stage=stage, detail=detail)
     obstacles = np.ascontiguousarray(ends[:, _OBSTACLES])
     shape = gripper_shape()
-    parts = (("gripper or camera", poses.pivots, shape.fixed), ("the moving jaw", poses.movers, shape.mover))
+    parts = (("gripper or camera", poses.pivots, shape.fixed), ("the moving jaw", poses.jaws, shape.mover))
     for part, T, vertices in parts:
         c = _first_capsule_hit(T, vertices[:_SELF_VERTICES], obstacles, _RADII[_OBSTACLES])
         if c >= 0:
             link = [capsule.link for capsule in CAPSULES if capsule.link in GRIPPER_OBSTACLES][c]
-            return Problem(reason="self", detail=f"{part} would hit {link}.")
+            return Rejection(reason=RejectionReason.SELF, stage=stage, detail=f"{part} would hit {link}.")
     return None
 
 
 def warm_up() -> None:
-    """Load what is compiled, so that the first check is as fast as the next."""
+    """Load compiled kernels, so that the first check is as fast as the next."""
     pose, read_only = np.eye(4)[None], gripper_shape().fixed[:1]
     ends = np.array([[[(0.0, 0.0, 0.0), (1.0, 0.0, 0.0)]]])
     _first_capsule_hit(pose, read_only, ends, np.zeros(1))
@@ -99,7 +91,7 @@ def warm_up() -> None:
 
 @njit(cache=True, nogil=True)
 def _first_capsule_hit(T, vertices, ends, radii):
-    """Return the first capsule (index) that any of `vertices`, moved by `T[n]`, is inside of at pose n, or −1."""
+    """Return the first capsule (index) that contains any of `vertices`, moved by `T[n]`, at pose n, or −1."""
     p = np.empty(3)
     for n in range(T.shape[0]):
         for v in range(vertices.shape[0]):

@@ -1,8 +1,7 @@
-"""Exact test of many moved vertices against a cloud: two grids, so that empty space costs one look-up.
+"""Exact distance test of many moved vertices against a cloud: two grids, so that empty space costs one look-up.
 
-A grid of 8 mm says "nothing near" for most vertices. Where it does not, the few 4 mm cells around the vertex hold the
-points as linked lists, in blocks so that empty space needs no lists, and true distances are compared: the answer equals
-brute force.
+A grid of 8 mm excludes most vertices. For the others the few 4 mm cells around the vertex hold the points as linked
+lists, in blocks so that empty space needs no lists, and true distances are compared: the answer equals brute force.
 """
 
 # ruff: noqa: PLR0917 - compiled functions take arrays one by one
@@ -17,16 +16,16 @@ from hal.base.errors import InvalidValueError
 _CELL_M = 0.004
 _CELLS = 8  # per block and axis
 _BLOCK_M = _CELL_M * _CELLS
-_PER_BLOCK = _CELLS**3
+_PER_BLOCK = _CELLS**3  # lists of a block that holds points; empty blocks have none
 _NEAR_M = 2 * _CELL_M  # measured: as fine as the cells gains little more, for eight times the memory
 _NEAR = _CELLS // 2  # per block and axis
-_ROUNDING_M = 1e-9
+_ROUNDING_M = 1e-9  # of coordinates up to some metres, far above float64's 1e-16
 MAX_THRESHOLD_M = 0.010
-"""The largest distance an index is asked for unless it was told otherwise [m]."""
+"""Largest threshold of an index by default [m]."""
 
 
 class SceneIndex:
-    """A cloud that can be asked whether anything comes near it. Built once per frame."""
+    """A cloud indexed for distance thresholds. Built once per frame."""
 
     def __init__(self, points: np.ndarray, max_threshold_m: float = MAX_THRESHOLD_M) -> None:
         """Index `points` (M, 3) [m]; later thresholds may be up to `max_threshold_m` [m].
@@ -36,7 +35,9 @@ class SceneIndex:
         """
         self.points = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 3)
         if not np.isfinite(self.points).all():
-            raise InvalidValueError("the cloud holds points that are not finite; drop them before indexing.")
+            raise InvalidValueError(
+                "SceneIndex: the cloud holds points that are not finite. Drop them before indexing.", code="not_finite"
+            )
         self.max_threshold_m = max_threshold_m
         if len(self.points):
             margin = max_threshold_m + _BLOCK_M
@@ -55,10 +56,9 @@ class SceneIndex:
         """Return per pose the first vertex (N,) that hits and a point (N,) it hits; −1 where nothing does.
 
         Raises:
-            ValueError: `threshold_m` is above what the index was built for.
+            ValueError: `threshold_m` is above the index's maximum.
         """
-        if not 0.0 <= threshold_m <= self.max_threshold_m:
-            raise InvalidValueError(f"threshold {threshold_m} m; this index serves 0 to {self.max_threshold_m} m.")
+        self._check_threshold(threshold_m)
         T = np.ascontiguousarray(T, dtype=np.float64)
         if not len(self.points):
             nothing = np.full(len(T), -1)
@@ -71,9 +71,16 @@ class SceneIndex:
         points = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 3)
         if not len(self.points):
             return np.zeros(len(points), dtype=bool)
-        if not 0.0 <= threshold_m <= self.max_threshold_m:
-            raise InvalidValueError(f"threshold {threshold_m} m; this index serves 0 to {self.max_threshold_m} m.")
+        self._check_threshold(threshold_m)
         return _near_points(points, threshold_m, self.points, self._origin, self._shape, *self._tables)
+
+    def _check_threshold(self, threshold_m: float) -> None:
+        if not 0.0 <= threshold_m <= self.max_threshold_m:
+            raise InvalidValueError(
+                f"SceneIndex: threshold {threshold_m} m is not served (allowed 0 to {self.max_threshold_m} m). "
+                "Build the index with a larger max_threshold_m.",
+                code="threshold",
+            )
 
 
 @njit(cache=True, nogil=True)
@@ -105,7 +112,7 @@ def _build(points, origin, shape, reach):
 
 @njit(cache=True, nogil=True)
 def _mark_around(near, i, j, k, reach):
-    """Mark what is within `reach` of cell (i, j, k), whose points then need no marks of their own."""
+    """Mark the space within `reach` of cell (i, j, k), whose points then need no marks of their own."""
     i_low, i_high = int((i * _CELL_M - reach) / _NEAR_M), int(((i + 1) * _CELL_M + reach) / _NEAR_M)
     j_low, j_high = int((j * _CELL_M - reach) / _NEAR_M), int(((j + 1) * _CELL_M + reach) / _NEAR_M)
     k_low, k_high = int((k * _CELL_M - reach) / _NEAR_M), int(((k + 1) * _CELL_M + reach) / _NEAR_M)
@@ -114,7 +121,7 @@ def _mark_around(near, i, j, k, reach):
 
 @njit(cache=True, nogil=True, inline="always")
 def _cell(block_of, i, j, k):
-    """Return where cell (i, j, k) keeps its list; −1 in an empty block."""
+    """Return the index of the list of cell (i, j, k); −1 in an empty block."""
     block = block_of[i // _CELLS, j // _CELLS, k // _CELLS] - 1
     if block < 0:
         return -1
@@ -145,7 +152,7 @@ def _touches(x, y, z, threshold, points, shape, block_of, head, after, ox, oy, o
 
 @njit(cache=True, nogil=True)
 def _touch_if_near(x, y, z, threshold, points, origin, shape, block_of, near, head, after):
-    """Return a point within `threshold` of (x, y, z), or −1, asking first where nothing is near."""
+    """Return a point within `threshold` of (x, y, z), or −1; the coarse grid excludes most queries."""
     if x < origin[0] or y < origin[1] or z < origin[2]:
         return -1
     i, j, k = int((x - origin[0]) / _NEAR_M), int((y - origin[1]) / _NEAR_M), int((z - origin[2]) / _NEAR_M)
@@ -155,10 +162,10 @@ def _touch_if_near(x, y, z, threshold, points, origin, shape, block_of, near, he
 
 
 @njit(cache=True, nogil=True)
-def _near_points(asked, threshold, points, origin, shape, block_of, near, head, after):
-    mask = np.empty(asked.shape[0], dtype=np.bool_)
-    for n in range(asked.shape[0]):
-        x, y, z = asked[n, 0], asked[n, 1], asked[n, 2]
+def _near_points(queries, threshold, points, origin, shape, block_of, near, head, after):
+    mask = np.empty(queries.shape[0], dtype=np.bool_)
+    for n in range(queries.shape[0]):
+        x, y, z = queries[n, 0], queries[n, 1], queries[n, 2]
         mask[n] = _touch_if_near(x, y, z, threshold, points, origin, shape, block_of, near, head, after) >= 0
     return mask
 

@@ -1,4 +1,4 @@
-"""A ranking's numbers: set by hand in the configuration, or fitted by `./z1 tune` and read from its file.
+"""Numbers of a ranking: configured, or fitted by `./z1 tune` and read from its file.
 
 The file is YAML of plain numbers; reading it needs nothing but this module, and nothing in it is executed.
 """
@@ -15,15 +15,16 @@ import yaml
 
 from hal.base.errors import InvalidValueError, UsageError
 from models.obb.mvbb import FitMethod
-from z1_runtime.grasping.features import FEATURES
+from z1_runtime.grasping.features import FEATURES, FORMER_NAMES
 
 FORMAT, VERSION = "z1-scoring", 1
-"""The first two lines of each file. The version counts changes that an older reader would misunderstand."""
+"""First two lines of each file. The version counts changes that an older reader would misunderstand."""
 NO_MIN_ALIGNMENT = -1.0
-"""An alignment that every grasp reaches."""
+"""Alignment that every grasp reaches."""
 
 _HINT = "Make one with `./z1 tune`."
-_REMAKE = "Make it anew with `./z1 tune`."
+_REMAKE = "Make it again with `./z1 tune`."
+_MAX_LOGIT = 30.0  # keeps the exponential finite and a probability off 0 and 1
 
 
 class ScoringError(UsageError):
@@ -34,7 +35,7 @@ class ScoringError(UsageError):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ScoringHead:
-    """Logistic regression on standardised features: how likely a grasp works out."""
+    """Success probability of a grasp: logistic regression on standardised features."""
 
     features: tuple[str, ...]
     """F keys of `FEATURES`."""
@@ -48,9 +49,8 @@ class ScoringHead:
 
     def __post_init__(self) -> None:
         if not self.features or set(self.features) - set(FEATURES):
-            raise InvalidValueError(
-                f"the head goes by {', '.join(self.features) or 'no feature'}; known: {', '.join(FEATURES)}. {_REMAKE}"
-            )
+            named = ", ".join(self.features) or "no feature"
+            raise InvalidValueError(f"the head uses {named}; known: {', '.join(FEATURES)}. {_REMAKE}")
         rows = {"mean": self.mean, "scale": self.scale, "coefficients": self.coefficients}
         for name, values in rows.items():
             if len(values) != len(self.features) or not np.isfinite(values).all():
@@ -59,39 +59,39 @@ class ScoringHead:
                 )
         if min(self.scale) <= 0.0 or not np.isfinite(self.intercept):
             raise InvalidValueError(
-                f"the head wants scale > 0 and a finite intercept; got {self.scale}, {self.intercept}."
+                f"the head needs scale > 0 and a finite intercept; got {self.scale}, {self.intercept}."
             )
 
     def probability(self, measured: np.ndarray) -> np.ndarray:
-        """Return the probability (N,), in (0, 1), that each grasp works out.
+        """Return the success probability (N,) of each grasp, in (0, 1).
 
         Args:
-            measured: (N, 11) as `z1_runtime.grasping.features.measure` returns it.
+            measured: (N, 11) as `z1_runtime.grasping.features.measure_features` returns it.
         """
         names = list(FEATURES)
         own = measured[:, [names.index(feature) for feature in self.features]]
         z = (own - self.mean) / np.array(self.scale) @ np.array(self.coefficients) + self.intercept
-        return 1.0 / (1.0 + np.exp(-np.clip(z, -30.0, 30.0)))
+        return 1.0 / (1.0 + np.exp(-np.clip(z, -_MAX_LOGIT, _MAX_LOGIT)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Ranking:
-    """By what numbers candidates are chosen and ranked."""
+    """Numbers by which candidates are filtered and ranked."""
 
     k_faces: int = 2
     """Faces nearest to the camera that may be approached."""
     alpha: float = 0.85
     """Weight of the alignment against the generator's score."""
     box_method: FitMethod = "pca"
-    """How the box is fitted."""
+    """Method that fits the box."""
     hard_filter: bool = True
-    """Whether grasps that come at none of these faces are dropped."""
+    """Drop grasps that approach none of these faces."""
     min_alignment: float = NO_MIN_ALIGNMENT
     """Grasps less aligned come after all others."""
     min_score: float = 0.0
-    """So do those to which the generator gave less."""
+    """Grasps that the generator scores lower do too."""
     head: ScoringHead | None = None
-    """What orders the grasps instead of α, or in the runtime instead of the weights of `planner.ability`."""
+    """Orders the grasps instead of α, or in the runtime instead of the weights of `planner.reachability`."""
 
     def __post_init__(self) -> None:
         if not 1 <= self.k_faces <= 6:
@@ -105,23 +105,23 @@ class Ranking:
         if not 0.0 <= self.min_score <= 1.0:
             raise InvalidValueError(f"min_score is {self.min_score}; allowed is 0 to 1.")
 
-    def wanted(self, alignments: np.ndarray, scores: np.ndarray) -> np.ndarray:
-        """Return (N,) whether grasps with these `alignments` (N,) and generator `scores` (N,) reach both thresholds."""
+    def passes_thresholds(self, alignments: np.ndarray, scores: np.ndarray) -> np.ndarray:
+        """Return (N,) whether grasps with `alignments` (N,), NaN without a box, and `scores` (N,) pass both."""
         return (np.nan_to_num(alignments, nan=1.0) >= self.min_alignment) & (scores >= self.min_score)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scoring:
-    """What a scoring file holds."""
+    """Content of a scoring file."""
 
     mvb: Ranking
-    """Of the paper's ranking, in the benchmark."""
+    """The paper's ranking, in the benchmark."""
     full: Ranking
-    """Of the runtime."""
+    """The runtime's."""
     tuned: tuple[str, ...] = ()
-    """Which of the two hold fitted values; the others hold those set by hand."""
+    """Those of the two that hold fitted values; the others hold the configured ones."""
     evidence: Mapping[str, Any] = field(default_factory=dict)
-    """Where it is from and what it was judged by; for people."""
+    """Source and evaluation of the values, for the reader."""
 
     def __post_init__(self) -> None:
         if set(self.tuned) - {"mvb", "full"}:
@@ -129,7 +129,7 @@ class Scoring:
 
 
 def save_scoring(scoring: Scoring, path: Path) -> None:
-    """Write `scoring` so that `load_scoring` reads it back; the file is there only when it is whole."""
+    """Write `scoring` to `path`, for `load_scoring`; an interrupted write leaves no file there."""
     content = {"format": FORMAT, "version": VERSION, **_plain(asdict(scoring))}
     partial = path.with_suffix(".partial")
     partial.write_text(yaml.safe_dump(content, sort_keys=False, allow_unicode=True, width=120), encoding="utf-8")
@@ -137,10 +137,10 @@ def save_scoring(scoring: Scoring, path: Path) -> None:
 
 
 def load_scoring(path: Path) -> Scoring:
-    """Return what the file at `path` holds.
+    """Return the scoring in the file at `path`.
 
     Raises:
-        ScoringError: it is missing, of another format or version, or has a key or value that does not belong there.
+        ScoringError: the file is missing, of another format or version, or has an unknown key or a wrong value.
     """
     content = _content(path)
     try:
@@ -151,9 +151,9 @@ def load_scoring(path: Path) -> Scoring:
             evidence=content.get("evidence") or {},
         )
     except KeyError as error:
-        raise ScoringError(f"the scoring {path} lacks {error}. {_REMAKE}") from error
+        raise ScoringError(f"the scoring {path} lacks {error}. {_REMAKE}", code="scoring_incomplete") from error
     except (TypeError, ValueError) as error:
-        raise ScoringError(f"the scoring {path} cannot be used: {error}") from error
+        raise ScoringError(f"the scoring {path} cannot be used: {error}", code="scoring_value") from error
 
 
 def _content(path: Path) -> Mapping[str, Any]:
@@ -161,14 +161,17 @@ def _content(path: Path) -> Mapping[str, Any]:
         content = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
         why = error.strerror if isinstance(error, OSError) else "it is no text"
-        raise ScoringError(f"the scoring {path} cannot be read: {why}. {_HINT}") from error
+        message = f"the scoring {path} cannot be read: {why}. {_HINT}"
+        raise ScoringError(message, code="scoring_unreadable") from error
     except yaml.YAMLError as error:
-        raise ScoringError(f"the scoring {path} is not YAML: {error}") from error
+        raise ScoringError(f"the scoring {path} is not YAML: {error}", code="scoring_unreadable") from error
     if not isinstance(content, Mapping) or content.get("format") != FORMAT:
-        raise ScoringError(f"{path} is no scoring file: its first line is not `format: {FORMAT}`. {_HINT}")
+        message = f"{path} is no scoring file: its first line is not `format: {FORMAT}`. {_HINT}"
+        raise ScoringError(message, code="scoring_format")
     if content.get("version") != VERSION:
         raise ScoringError(
-            f"the scoring {path} is of version {content.get('version')!r}; this program reads {VERSION}. {_REMAKE}"
+            f"the scoring {path} is of version {content.get('version')!r}; this program reads {VERSION}. {_REMAKE}",
+            code="scoring_version",
         )
     return content
 
@@ -189,7 +192,7 @@ _TYPES = {"k_faces": (int,), "hard_filter": (bool,), "box_method": (str,)}
 
 def _head(values: Mapping[str, Any]) -> ScoringHead:
     columns = {key: tuple(float(value) for value in values[key]) for key in ("mean", "scale", "coefficients")}
-    features = tuple(str(name) for name in values["features"])
+    features = tuple(FORMER_NAMES.get(str(name), str(name)) for name in values["features"])
     return ScoringHead(features=features, intercept=float(values["intercept"]), **columns)
 
 
@@ -197,7 +200,7 @@ def _known(data: Any, kind: type) -> dict[str, Any]:
     """Return `data` as the fields of the dataclass `kind`."""
     names = [each.name for each in fields(kind)]
     if not isinstance(data, Mapping):
-        raise InvalidValueError(f"it holds {data!r} where {', '.join(names)} should stand.")
+        raise InvalidValueError(f"it holds {data!r} instead of {', '.join(names)}.")
     if unknown := [key for key in data if key not in names]:
         raise InvalidValueError(f"it has an unknown key {unknown[0]!r}; known: {', '.join(names)}.")
     return dict(data)

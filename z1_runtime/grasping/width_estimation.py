@@ -1,4 +1,4 @@
-"""What the object's points say of each grasp: how wide it is there, how far it reaches, how much of a jaw it fills."""
+"""Width, depth and pad support of the object at each grasp, estimated from its points."""
 
 from __future__ import annotations
 
@@ -10,33 +10,37 @@ from numba import njit
 from hal.base.z1_gripper import PAD_HALF_WIDTH_M
 
 _PALM_HALF_WIDTH_M = 0.041
-_ASIDE_M = 0.005  # what stands out this far beside the width still goes towards the palm between the jaws
-_FRONT_SHARE = 0.01  # of the points between: one speckle shall not push the whole hand back
-_EDGE_SHARE = 0.01
-_SEEN_M = 0.005
-_PUSHED_M = 0.006  # what stands out further than this is no error of the middle
-_GROWTHS, _GROWN_M = 3, 0.001  # times that what then stands beside is looked at again, if the middle moved this far
-_WIDTH_Z_M, _WIDTH_Y_M = 0.025, 0.06
-_PAD_Z_M = 0.012
-_STRIPS = 5
-_STRIP_GAP_M = 0.008
-_HIDDEN_Z_M, _HIDDEN_Y_M = 0.020, 0.025
+_FRONT_MARGIN_M = 0.005  # points this far outside the width still move towards the palm between the jaws
+_FRONT_QUANTILE = 0.01  # of the points between the jaws: a single speckle must not push the whole gripper back
+_EDGE_QUANTILE = 0.01  # of the points between the pads, for the same reason
+_OBSERVED_M = 0.005  # a contact with no point within this is unobserved
+_MAX_SHIFT_M = 0.006  # a larger protrusion is no error of the centre
+_MAX_SHIFTS, _MIN_SHIFT_M = 3, 0.001  # the centre is estimated again while it still moves by this much
+_WIDTH_Z_M, _WIDTH_Y_M = 0.025, 0.06  # region along the approach and the opening that gives an unknown width
+_PAD_Z_M = 0.012  # half length, along the approach, of the part of a pad that presses
+_STRIPS = 5  # across a pad's width; each counts a fifth of the support
+_STRIP_GAP_M = 0.008  # a strip at this gap from its pad supports nothing
+_OCCLUDED_Z_M, _OCCLUDED_Y_M = 0.020, 0.025  # region beyond a contact in which occluded points widen the grasp
 
 
 class WidthEstimate(NamedTuple):
-    """What the points say of N grasps; z is measured from the contacts' middle, not from the grasp's origin."""
+    """Estimates for N grasps; z is measured from the contacts' midpoint, not from the grasp's origin."""
 
     widths_m: np.ndarray
-    """(N,) as given, or more where more is seen; where it was NaN, twice the farthest point beside the pads, NaN where
-    there is none [m]."""
+    """(N,) as given, or more where more is observed; where it was NaN, twice the farthest point between the pads, NaN
+    where there is none [m]."""
     fronts_m: np.ndarray
-    """(N,) how far the object reaches towards the palm [m]."""
+    """(N,) extent of the object towards the palm [m]."""
     shifts_m: np.ndarray
-    """(N,) how far along y the grasp must move for its width to hold all that is seen between the pads [m]."""
+    """(N,) offset along y that centres the grasp on the points between its pads [m]."""
 
 
-def fit_grasps(
-    T_base_grasps: np.ndarray, widths_m: np.ndarray, points: np.ndarray, contact_depth_m: float, unseen_m: float = 0.0
+def estimate_widths(
+    T_base_grasps: np.ndarray,
+    widths_m: np.ndarray,
+    points: np.ndarray,
+    contact_depth_m: float,
+    occlusion_margin_m: float = 0.0,
 ) -> WidthEstimate:
     """Measure the object's `points` (M, 3) in the frames of grasps (N, 4, 4) with `widths_m` (N,), NaN = not known.
 
@@ -44,35 +48,38 @@ def fit_grasps(
         T_base_grasps: z approach, y opening.
         widths_m: distance between the contacts [m].
         points: in the base frame [m].
-        contact_depth_m: how far the grasps' origins lie beyond their contacts [m].
-        unseen_m: how much farther out a contact is thought to be where no point is seen near it [m].
+        contact_depth_m: distance of the grasps' origins beyond their contacts [m].
+        occlusion_margin_m: added at each contact without an observed point near it [m].
     """
     T, widths, cloud = (np.ascontiguousarray(array, dtype=np.float64) for array in (T_base_grasps, widths_m, points))
-    return WidthEstimate(*_fit(T, widths, cloud, contact_depth_m, unseen_m))
+    return WidthEstimate(*_estimate(T, widths, cloud, contact_depth_m, occlusion_margin_m))
 
 
 def measure_support(
     T_base_grasps: np.ndarray, widths_m: np.ndarray, points: np.ndarray, contact_depth_m: float
 ) -> np.ndarray:
-    """Return the share (N,) of the pads' width, in [0, 1], along which a point is seen where a pad will press.
+    """Return the ratio (N,) of the pads' width, in [0, 1], along which a point is observed where a pad will press.
 
-    A contact that was only supposed, on a side that nothing shows, supports nothing. Arguments as in `fit_grasps`.
+    A contact assumed on an unobserved side supports nothing. Arguments as in `estimate_widths`.
     """
     T, widths, cloud = (np.ascontiguousarray(array, dtype=np.float64) for array in (T_base_grasps, widths_m, points))
     return _support(T, widths, cloud, contact_depth_m)
 
 
-def make_room(
-    T_base_grasps: np.ndarray, widths_m: np.ndarray, hidden: np.ndarray, contact_depth_m: float
+def expand_for_occlusion(
+    T_base_grasps: np.ndarray, widths_m: np.ndarray, occluded_points: np.ndarray, contact_depth_m: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return grasps (N, 4, 4) and widths (N,) that go around what may be there unseen as well.
+    """Return grasps (N, 4, 4) and widths (N,) that enclose the occluded part of the object as well.
 
-    Where `hidden` (K, 3) goes on beside one contact, the width grows to that side and the grasp moves half as much.
+    Where `occluded_points` (K, 3) continue beyond a contact, the width grows to that side and the grasp moves half as
+    much.
     """
     low, high = -0.5 * widths_m, 0.5 * widths_m
-    if len(hidden):
-        T, widths, cloud = (np.ascontiguousarray(array, np.float64) for array in (T_base_grasps, widths_m, hidden))
-        below, above = _reach_aside(T, widths, cloud, contact_depth_m)
+    if len(occluded_points):
+        T, widths, cloud = (
+            np.ascontiguousarray(array, np.float64) for array in (T_base_grasps, widths_m, occluded_points)
+        )
+        below, above = _occluded_extent(T, widths, cloud, contact_depth_m)
         low, high = np.fmin(low, below), np.fmax(high, above)
     moved = T_base_grasps.copy()
     moved[:, :3, 3] += (0.5 * np.nan_to_num(low + high))[:, None] * T_base_grasps[:, :3, 1]
@@ -89,51 +96,51 @@ def _local(T, p, contact_depth_m):
 
 
 @njit(cache=True)
-def _fit(T, given, points, contact_depth_m, unseen_m):  # noqa: PLR0912 - one pass over all points for each grasp
+def _estimate(T, given, points, contact_depth_m, occlusion_margin_m):  # noqa: PLR0912 - one pass over all points for each grasp
     n = len(T)
     widths, fronts, shifts = given.copy(), np.zeros(n), np.zeros(n)
-    local, between, aside = np.empty((len(points), 3)), np.empty(len(points)), np.empty(len(points))
+    local, between, across = np.empty((len(points), 3)), np.empty(len(points)), np.empty(len(points))
     for g in range(n):
         widest = np.nan
         for m in range(len(points)):
             x, y, z = _local(T[g], points[m], contact_depth_m)
             local[m, 0], local[m, 1], local[m, 2] = x, y, z
-            beside = abs(x) < _PALM_HALF_WIDTH_M and abs(z) < _WIDTH_Z_M and abs(y) < _WIDTH_Y_M
-            if beside and not abs(y) <= widest:
+            at_jaws = abs(x) < _PALM_HALF_WIDTH_M and abs(z) < _WIDTH_Z_M and abs(y) < _WIDTH_Y_M
+            if at_jaws and not abs(y) <= widest:
                 widest = abs(y)
         if np.isnan(widths[g]):
             widths[g] = 2.0 * widest
         half, shift, low, high = 0.5 * widths[g], 0.0, np.nan, np.nan
-        for _ in range(_GROWTHS):
+        for _ in range(_MAX_SHIFTS):
             count = 0
             for m in range(len(points)):
                 x, y, z = local[m]
-                if abs(x) < PAD_HALF_WIDTH_M and abs(z) < _PAD_Z_M and abs(y - shift) < half + _PUSHED_M:
-                    aside[count] = y
+                if abs(x) < PAD_HALF_WIDTH_M and abs(z) < _PAD_Z_M and abs(y - shift) < half + _MAX_SHIFT_M:
+                    across[count] = y
                     count += 1
             if not count:
                 break
-            across = np.sort(aside[:count])
-            skipped = int(_EDGE_SHARE * count)
-            low, high = across[skipped], across[count - 1 - skipped]
+            ordered = np.sort(across[:count])
+            skipped = int(_EDGE_QUANTILE * count)
+            low, high = ordered[skipped], ordered[count - 1 - skipped]
             half = max(half, 0.5 * (high - low))
-            moved = max(high - shift - half, 0.0) - max(shift - half - low, 0.0)
-            shift += moved
-            if abs(moved) < _GROWN_M:
+            moved_m = max(high - shift - half, 0.0) - max(shift - half - low, 0.0)
+            shift += moved_m
+            if abs(moved_m) < _MIN_SHIFT_M:
                 break
         if not np.isnan(low):
-            above = unseen_m * (high < shift + half - _SEEN_M)
-            below = unseen_m * (low > shift - half + _SEEN_M)
+            above = occlusion_margin_m * (high < shift + half - _OBSERVED_M)
+            below = occlusion_margin_m * (low > shift - half + _OBSERVED_M)
             half += 0.5 * (above + below)
             widths[g], shifts[g] = 2.0 * half, shift + 0.5 * (above - below)
         count = 0
         for m in range(len(points)):
             x, y, z = local[m]
-            if abs(x) < _PALM_HALF_WIDTH_M and abs(y - shifts[g]) < half + _ASIDE_M:
+            if abs(x) < _PALM_HALF_WIDTH_M and abs(y - shifts[g]) < half + _FRONT_MARGIN_M:
                 between[count] = z
                 count += 1
         if count:
-            nearest = np.sort(between[:count])[int(_FRONT_SHARE * count)]
+            nearest = np.sort(between[:count])[int(_FRONT_QUANTILE * count)]
             fronts[g] = max(-nearest, 0.0)
     return widths, fronts, shifts
 
@@ -155,13 +162,13 @@ def _support(T, widths, points, contact_depth_m):
 
 
 @njit(cache=True)
-def _reach_aside(T, widths, hidden, contact_depth_m):
+def _occluded_extent(T, widths, points, contact_depth_m):
     low, high = np.full(len(T), np.nan), np.full(len(T), np.nan)
     for g in range(len(T)):
-        reach = 0.5 * widths[g] + _HIDDEN_Y_M
-        for m in range(len(hidden)):
-            x, y, z = _local(T[g], hidden[m], contact_depth_m)
-            if abs(x) < PAD_HALF_WIDTH_M and abs(z) < _HIDDEN_Z_M and abs(y) < reach:
+        reach = 0.5 * widths[g] + _OCCLUDED_Y_M
+        for m in range(len(points)):
+            x, y, z = _local(T[g], points[m], contact_depth_m)
+            if abs(x) < PAD_HALF_WIDTH_M and abs(z) < _OCCLUDED_Z_M and abs(y) < reach:
                 if not y >= low[g]:
                     low[g] = y
                 if not y <= high[g]:
@@ -170,8 +177,8 @@ def _reach_aside(T, widths, hidden, contact_depth_m):
 
 
 def warm_up() -> None:
-    """Load what is compiled, so that the first fit is as fast as the next."""
+    """Load compiled kernels, so that the first estimate is as fast as the next."""
     one = np.eye(4)[None]
-    fit_grasps(one, np.array([0.05]), np.zeros((1, 3)), 0.0)
+    estimate_widths(one, np.array([0.05]), np.zeros((1, 3)), 0.0)
     measure_support(one, np.array([0.05]), np.zeros((1, 3)), 0.0)
-    make_room(one, np.array([0.05]), np.zeros((1, 3)), 0.0)
+    expand_for_occlusion(one, np.array([0.05]), np.zeros((1, 3)), 0.0)

@@ -1,4 +1,4 @@
-"""Streams planned motions to the servo, a fifth of a second ahead, and notices when one does not arrive."""
+"""Execution of planned motions: chunks streamed to the servo a fifth of a second ahead, and checks of its progress."""
 
 from __future__ import annotations
 
@@ -15,29 +15,31 @@ from hal.base.errors import InvalidValueError, Z1Error
 from hal.base.messages import ArmState, ServoStatus, TrajectoryChunk
 from z1_runtime.types import JointTrajectory
 
+_QUIET_POLLS = 3  # in a row: a joint that turns back is at rest for one
+
 
 class MotionError(Z1Error, RuntimeError):
-    """A motion was begun and not finished; the arm has braked and holds."""
+    """A motion that was begun and not finished; the arm has braked and holds."""
 
     default_code = "motion"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ExecutorConfig:
-    """How trajectories are handed over."""
+    """Timing of the transfer of trajectories to the servo."""
 
     lead_s: float = 0.2
-    """How much motion waits at the servo [s]; a dead runtime moves the arm no longer than this."""
+    """Duration of the motion that waits at the servo [s]; after the runtime's end the arm moves no longer than this."""
     chunk_s: float = 0.1
     """Length of one message [s]."""
     poll_s: float = 0.02
-    """How often the servo is asked how far it is [s]."""
+    """Period at which the servo's progress is read [s]."""
     stall_timeout_s: float = 1.0
-    """How long the servo may play nothing of a motion before it counts as lost [s]."""
+    """Maximum time without progress of a motion before it counts as lost [s]."""
     settle_dq: float = 0.02
     """Joint speed that counts as rest [rad/s]."""
     settle_timeout_s: float = 3.0
-    """How long a motion may take to come to rest after its end [s]."""
+    """Maximum time that a motion takes to come to rest after its end [s]."""
 
     def __post_init__(self) -> None:
         if not 0 < self.poll_s < self.chunk_s < self.lead_s:
@@ -60,34 +62,35 @@ class Executor:
         self._clock = clock
         self._config = config or ExecutorConfig()
         self.watchers: list[Watcher] = []
-        """Called with the arm's state every poll, for logs; must return at once."""
+        """Called with the arm's state at every poll, for logs; must return at once."""
 
     def execute(self, trajectory: JointTrajectory) -> None:
         """Play `trajectory` to its end; return when the servo has sent its last point.
 
         Raises:
             InvalidMessageError: the trajectory holds values that are not finite; nothing moves.
-            CommandRejectedError: the servo will not take it (stopped, wrong start, limits, lease).
-            MotionError: it was dropped on the way, with the servo's reason, or the servo plays it no longer.
+            CommandRejectedError: the servo rejects it (stopped, wrong start, limits, lease).
+            MotionError: it was dropped while it ran, with the servo's reason, or makes no more progress.
         """
         trajectory_id = self._arm.status().trajectory_id + 1
         chunks = _chunks(trajectory, trajectory_id, self._config.chunk_s)
         sent_s, played_s = 0.0, 0.0
         moved_s = self._clock.now_s()
         while True:
-            status = self._look()
+            status = self._poll()
             ours = status.trajectory_id == trajectory_id
             if ours and status.finished:
                 return
             if ours and status.reason:
                 raise MotionError(
                     f"the motion was dropped {status.trajectory_time_s:.2f} s into {trajectory.duration_s:.2f} s: "
-                    f"{status.reason}; the arm holds."
+                    f"{status.reason}; the arm holds.",
+                    code="dropped",
                 )
             if ours and status.trajectory_time_s > played_s:
                 played_s, moved_s = status.trajectory_time_s, self._clock.now_s()
             elif self._clock.now_s() - moved_s > self._config.stall_timeout_s:
-                raise MotionError(_stalled(status, trajectory_id, played_s))
+                raise MotionError(_describe_stall(status, trajectory_id, played_s), code="stalled")
             while chunks and sent_s - played_s < self._config.lead_s:
                 chunk = chunks.popleft()
                 self._arm.stream(chunk)
@@ -101,22 +104,23 @@ class Executor:
             MotionError: it does not come to rest in time.
         """
         deadline_s = self._clock.now_s() + self._config.settle_timeout_s
-        quiet = 0
+        n_quiet = 0
         while True:
             self._clock.sleep_until(self._clock.now_s() + self._config.poll_s)
-            self._look()
+            self._poll()
             state = self._arm.read_state()
-            quiet = quiet + 1 if np.abs(state.dq).max() < self._config.settle_dq else 0
-            if quiet >= 3:
+            n_quiet = n_quiet + 1 if np.abs(state.dq).max() < self._config.settle_dq else 0
+            if n_quiet >= _QUIET_POLLS:
                 return state
             if self._clock.now_s() > deadline_s:
                 joint = int(np.abs(state.dq).argmax())
                 raise MotionError(
                     f"{z1.JOINT_NAMES[joint]} still moves at {state.dq[joint]:.3f} rad/s, "
-                    f"{self._config.settle_timeout_s} s after the motion; rest is {self._config.settle_dq} rad/s."
+                    f"{self._config.settle_timeout_s} s after the motion; rest is {self._config.settle_dq} rad/s.",
+                    code="not_settled",
                 )
 
-    def _look(self) -> ServoStatus:
+    def _poll(self) -> ServoStatus:
         status = self._arm.status()
         if self.watchers:
             state = self._arm.read_state()
@@ -131,20 +135,20 @@ def _chunks(trajectory: JointTrajectory, trajectory_id: int, length_s: float) ->
     return deque(
         TrajectoryChunk(
             trajectory_id=trajectory_id,
-            t_s=trajectory.t_s[piece],
-            q=trajectory.q[piece],
-            dq=trajectory.dq[piece],
-            final=piece.stop == n,
+            t_s=trajectory.t_s[part],
+            q=trajectory.q[part],
+            dq=trajectory.dq[part],
+            final=part.stop == n,
         )
-        for piece in trajectory.pieces(length_s)
+        for part in trajectory.split(length_s)
     )
 
 
-def _stalled(status: ServoStatus, trajectory_id: int, played_s: float) -> str:
+def _describe_stall(status: ServoStatus, trajectory_id: int, played_s: float) -> str:
     where = f"after {played_s:.2f} s of it" if played_s > 0.0 else "before its start"
     now = f"the servo is {status.mode.value}, at trajectory {status.trajectory_id}"
     reason = f" ({status.reason})" if status.reason else ""
     return (
-        f"motion {trajectory_id} stands still {where}: {now}{reason}. "
-        "The HAL was restarted, its ticks have ended, or another has taken the arm; see its log."
+        f"motion {trajectory_id} makes no progress {where}: {now}{reason}. "
+        "The HAL was restarted, its ticks have ended, or another client has taken the arm; see its log."
     )

@@ -1,4 +1,4 @@
-"""How fast a motion may be, in joints and along straight lines."""
+"""Limits of motions: speeds in joints and along straight lines, and the joints' own range."""
 
 from __future__ import annotations
 
@@ -11,7 +11,10 @@ from hal.base import z1
 from hal.base.errors import InvalidValueError
 
 DEFAULT_SPEED = 0.5
-"""Fraction of the arm's limits a motion uses unless told otherwise."""
+"""Fraction of the arm's limits that a motion uses by default."""
+
+LIMIT_TOLERANCE_RAD = 0.005
+"""A measured joint at rest at its limit, or a planned one, may be this far beyond it [rad]."""
 
 # At full speed; the Z1's data sheet has no Cartesian figures, these are ours
 _FULL_LINEAR = (0.5, 2.0, 20.0)
@@ -24,7 +27,7 @@ def _scaled(limit: np.ndarray) -> Callable[[], np.ndarray]:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MotionLimits:
-    """How fast a motion may be; `MotionLimits()` is half of what the arm can, see `at_speed`.
+    """Limits of a motion; `MotionLimits()` is half of the arm's own, see `at_speed`.
 
     Raises:
         ValueError: a limit is not positive, not finite, or above `hal.base.z1`'s.
@@ -63,7 +66,7 @@ class MotionLimits:
                     raise InvalidValueError(f"{name} is {getattr(self, name)}; it must be positive and finite.")
 
     def scaled(self, factor: float) -> MotionLimits:
-        """Return limits `factor` times as high, where the arm's own do not end that.
+        """Return limits `factor` times as high, but at most the arm's own.
 
         Raises:
             ValueError: `factor` is not positive and finite.
@@ -99,3 +102,19 @@ class MotionLimits:
             angular_acceleration=float(angular[1]),
             angular_jerk=float(angular[2]),
         )
+
+
+def clip_joints(q: np.ndarray, name: str) -> np.ndarray:
+    """Return `q` (7,) inside the joint limits, where it is at most `LIMIT_TOLERANCE_RAD` beyond them.
+
+    Raises:
+        ValueError: it is further beyond, not finite, or no joint vector; the message calls it `name`.
+    """
+    q = np.array(q, dtype=np.float64)
+    if q.shape != (z1.N_JOINTS,):
+        raise InvalidValueError(f"{name} has shape {q.shape}; a joint vector is ({z1.N_JOINTS},).", code="shape")
+    for joint, value, low, high in zip(z1.JOINT_NAMES, q, z1.Q_MIN, z1.Q_MAX, strict=True):
+        if not low - LIMIT_TOLERANCE_RAD <= value <= high + LIMIT_TOLERANCE_RAD:
+            message = f"{name}: {joint} is {value:.4f} rad; allowed is {low:.4f} to {high:.4f} rad."
+            raise InvalidValueError(message, code="joint_limit")
+    return np.clip(q, z1.Q_MIN, z1.Q_MAX)

@@ -1,4 +1,7 @@
-"""Timed motions of arm and gripper: jerk-limited, at rest at both ends, inside the limits, sampled at 500 Hz."""
+"""Timed motions of arm and gripper: jerk-limited, at rest at both ends, inside the limits, sampled at 500 Hz.
+
+A joint a hair beyond a limit is clipped to it, see `clip_joints`; further beyond is an error of the caller.
+"""
 
 from __future__ import annotations
 
@@ -12,12 +15,12 @@ from scipy.interpolate import make_interp_spline
 from hal.base import transforms, z1
 from hal.base.errors import InvalidValueError, Z1Error
 from z1_runtime.geometry.kinematics import POSITION_TOLERANCE_M, ROTATION_TOLERANCE_RAD, IkFailure, Kinematics
-from z1_runtime.motion.limits import MotionLimits
+from z1_runtime.motion.limits import MotionLimits, clip_joints
 from z1_runtime.types import JointTrajectory
 
-_LIMIT_ATOL = 1e-9  # rounding [rad]
+_ROUNDING_RAD = 1e-9
 
-_OVERSHOOT = 1e-6  # of the way; Ruckig's rounding
+_OVERSHOOT = 1e-6  # of the length; Ruckig's rounding
 
 _ALREADY_THERE = 1e-6  # lines shorter than this are no lines [m, rad]
 _WAYPOINT_SPACING_M = 0.005
@@ -29,10 +32,10 @@ _STRETCH_MARGIN = 1.005  # the peaks between two samples; 1.5 % of the jerk
 
 
 class PathFailure(Z1Error):
-    """A straight motion cannot be done; the message says where along it and why.
+    """A straight motion without joints inside the limits; the message has the place along it and the reason.
 
     Attributes:
-        fraction: how far along the way it breaks, in [0, 1].
+        fraction: place along the line at which it breaks, in [0, 1].
         joint: the joint at fault, or None.
     """
 
@@ -45,14 +48,14 @@ class PathFailure(Z1Error):
 
 
 def hold(q: np.ndarray, duration_s: float) -> JointTrajectory:
-    """Stay at `q` (7,) for `duration_s` [s], rounded up to whole control periods, at least one.
+    """Hold `q` (7,) for `duration_s` [s], rounded up to whole control periods, at least one.
 
     Raises:
         ValueError: `q` is not a joint vector inside the limits, or `duration_s` is negative or not finite.
     """
-    q = _check_joints(q, "q")
+    q = clip_joints(q, "q")
     if not 0.0 <= duration_s < np.inf:
-        raise InvalidValueError(f"duration_s is {duration_s}; it must be finite and not negative.")
+        raise InvalidValueError(f"duration_s is {duration_s}; it must be finite and not negative.", code="duration")
     t_s = _sample_times(duration_s)
     return JointTrajectory(t_s=t_s, q=np.tile(q, (len(t_s), 1)), dq=np.zeros((len(t_s), z1.N_JOINTS)))
 
@@ -61,21 +64,21 @@ def joint_move(q_start: np.ndarray, q_goal: np.ndarray, limits: MotionLimits | N
     """Move from rest at `q_start` (7,) to rest at `q_goal` (7,), straight in joint space.
 
     One Ruckig motion along the segment times all joints: Ruckig's own phase synchronisation leaves the segment where
-    another joint's limit than the slowest one's would bind (seen: 0.15 rad beside it), and a collision check would
-    have looked at the wrong path.
+    another joint's limit than the slowest one's would bind (observed: by 0.15 rad), and a collision check would have
+    checked the wrong path.
 
     Raises:
         ValueError: a joint vector is outside the limits, or not finite.
     """
-    q_start, q_goal = _check_joints(q_start, "q_start"), _check_joints(q_goal, "q_goal")
+    q_start, q_goal = clip_joints(q_start, "q_start"), clip_joints(q_goal, "q_goal")
     limits = limits or MotionLimits()
-    way = q_goal - q_start
-    length_rad = float(np.abs(way).max())
-    if length_rad < _LIMIT_ATOL:
+    offset = q_goal - q_start
+    length_rad = float(np.abs(offset).max())
+    if length_rad < _ROUNDING_RAD:
         motion = hold(q_goal, 0.0)
         motion.q[0] = q_start
         return motion
-    direction = way / length_rad
+    direction = offset / length_rad
     per_joint = np.array([limits.velocity, limits.acceleration, limits.jerk]) / np.maximum(np.abs(direction), 1e-12)
     t_s, along, speed, _, _ = _sample(_rest_to_rest(length_rad, per_joint.min(axis=1)))
     q = np.clip(q_start + along[:, None] * direction, z1.Q_MIN, z1.Q_MAX)
@@ -84,18 +87,20 @@ def joint_move(q_start: np.ndarray, q_goal: np.ndarray, limits: MotionLimits | N
 
 
 def joint_path(qs: np.ndarray, limits: MotionLimits | None = None) -> JointTrajectory:
-    """Move through `qs` (K, 7), at rest at each, so that the way between two is exactly the segment a check has seen.
+    """Move through `qs` (K, 7), at rest at each, so that the path between two is exactly the segment that was checked.
 
     Raises:
         ValueError: fewer than two points, or one outside the limits.
     """
     if len(qs) < 2:
-        raise InvalidValueError(f"joint_path was given {len(qs)} points; it needs at least a start and a goal.")
+        raise InvalidValueError(
+            f"joint_path: {len(qs)} points are not enough. Give at least a start and a goal.", code="too_few_points"
+        )
     return concatenate([joint_move(a, b, limits) for a, b in pairwise(qs)])
 
 
 def gripper_move(q: np.ndarray, jaw_goal: float, limits: MotionLimits | None = None) -> JointTrajectory:
-    """Move the gripper of `q` (7,) to `jaw_goal` [rad] while the arm stands still.
+    """Move the gripper of `q` (7,) to `jaw_goal` [rad] while the arm is at rest.
 
     Raises:
         ValueError: `q` or `jaw_goal` is outside the limits, or not finite.
@@ -121,7 +126,7 @@ def straight_move(  # noqa: PLR0917 - the order of the line itself: from, to, th
             2 mm and 1° of it.
         T_goal: (4, 4) T_base_pivot to end at.
         q_start: (7,) joints at the start [rad].
-        jaw_goal: mover angle at the end [rad]; None keeps it.
+        jaw_goal: jaw angle at the end [rad]; None keeps it.
         limits: joint and Cartesian limits, both hold all along.
 
     Raises:
@@ -129,9 +134,9 @@ def straight_move(  # noqa: PLR0917 - the order of the line itself: from, to, th
         ValueError: `q_start` or `jaw_goal` outside the limits, `q_start` not at `T_start`, or not a pose.
     """
     limits = limits or MotionLimits()
-    q_start = _check_joints(q_start, "q_start")
-    jaw_goal = float(q_start[-1]) if jaw_goal is None else jaw_goal
-    _check_joints(np.append(q_start[:-1], jaw_goal), "the goal")
+    q_start = clip_joints(q_start, "q_start")
+    q_goal = np.append(q_start[:-1], q_start[-1] if jaw_goal is None else jaw_goal)
+    jaw_goal = float(clip_joints(q_goal, "the goal")[-1])
     T_goal = transforms.check_pose(T_goal, "T_goal")
     T_from = kinematics.pivot(q_start[: z1.N_ARM])
     _check_start(T_from, transforms.check_pose(T_start, "T_start"))
@@ -156,12 +161,14 @@ def concatenate(parts: list[JointTrajectory]) -> JointTrajectory:
         ValueError: no parts, or a part starts somewhere else.
     """
     if not parts:
-        raise InvalidValueError("there is nothing to concatenate; give at least one motion.")
+        raise InvalidValueError("there is nothing to concatenate; give at least one motion.", code="too_few_points")
     for before, after in pairwise(parts):
         gap = np.abs(after.q[0] - before.q[-1])
-        if gap.max() > _LIMIT_ATOL:
+        if gap.max() > _ROUNDING_RAD:
             joint = int(gap.argmax())
-            raise InvalidValueError(f"{z1.JOINT_NAMES[joint]} would jump by {gap[joint]:.6f} rad between two motions.")
+            raise InvalidValueError(
+                f"{z1.JOINT_NAMES[joint]} would jump by {gap[joint]:.6f} rad between two motions.", code="jump"
+            )
     q = np.concatenate([parts[0].q, *(part.q[1:] for part in parts[1:])])
     dq = np.concatenate([parts[0].dq, *(part.dq[1:] for part in parts[1:])])
     return JointTrajectory(t_s=np.arange(len(q)) * z1.CONTROL_PERIOD_S, q=q, dq=dq)
@@ -171,7 +178,7 @@ def concatenate(parts: list[JointTrajectory]) -> JointTrajectory:
 
 
 def _rest_to_rest(length: float, fastest: np.ndarray) -> ruckig.Trajectory:
-    """Return Ruckig's time-optimal way from 0 to `length` under `fastest` = (velocity, acceleration, jerk) limits.
+    """Return Ruckig's time-optimal motion from 0 to `length` under `fastest` = (velocity, acceleration, jerk) limits.
 
     Waypoints are never given to Ruckig: its wheel sends them to a web service.
     """
@@ -195,7 +202,7 @@ def _sample_times(duration_s: float) -> np.ndarray:
 
 
 def _sample(trajectory: ruckig.Trajectory) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return times, and position, velocity, acceleration and jerk along the way, each (N,), at the control period.
+    """Return times, and position, velocity, acceleration and jerk along the path, each (N,), at the control period.
 
     The motion is slowed by less than one period in all, so that the last sample is its end.
     """
@@ -238,13 +245,13 @@ def _joint_spline(
 def _time_along(
     spline: Callable[..., np.ndarray], length_m: float, angle_rad: float, limits: MotionLimits
 ) -> ruckig.Trajectory:
-    """Return s(t) from 0 to 1, as fast as the Cartesian limits let it and slowed evenly until the joints' hold too."""
+    """Return s(t) from 0 to 1, as fast as the Cartesian limits allow, slowed evenly until the joints' hold too."""
     slopes = np.abs(spline(np.linspace(0.0, 1.0, 200), 1)).max(axis=0)
-    per_joint = np.array([limits.velocity, limits.acceleration, limits.jerk]) / np.maximum(slopes, _LIMIT_ATOL)
+    per_joint = np.array([limits.velocity, limits.acceleration, limits.jerk]) / np.maximum(slopes, _ROUNDING_RAD)
     linear = np.array([limits.linear_velocity, limits.linear_acceleration, limits.linear_jerk])
     angular = np.array([limits.angular_velocity, limits.angular_acceleration, limits.angular_jerk])
-    fastest = np.minimum(per_joint.min(axis=1), linear / max(length_m, _LIMIT_ATOL))
-    fastest = np.minimum(fastest, angular / max(angle_rad, _LIMIT_ATOL))
+    fastest = np.minimum(per_joint.min(axis=1), linear / max(length_m, _ROUNDING_RAD))
+    fastest = np.minimum(fastest, angular / max(angle_rad, _ROUNDING_RAD))
     trajectory = _rest_to_rest(1.0, fastest)
 
     _, s, *rates = _sample(trajectory)
@@ -263,27 +270,18 @@ def _time_along(
 # --- Checks -----------------------------------------------------------------------------------------------
 
 
-def _check_joints(q: np.ndarray, name: str) -> np.ndarray:
-    q = np.array(q, dtype=np.float64)
-    if q.shape != (z1.N_JOINTS,):
-        raise InvalidValueError(f"{name} has shape {q.shape}; a joint vector is ({z1.N_JOINTS},).")
-    for joint, value, low, high in zip(z1.JOINT_NAMES, q, z1.Q_MIN, z1.Q_MAX, strict=True):
-        if not low - _LIMIT_ATOL <= value <= high + _LIMIT_ATOL:
-            raise InvalidValueError(f"{name}: {joint} is {value:.4f} rad; allowed is {low:.4f} to {high:.4f} rad.")
-    return q
-
-
 def _check_start(T_from: np.ndarray, T_start: np.ndarray) -> None:
     distance_m, angle_rad = transforms.pose_error(T_from, T_start)
     if distance_m > POSITION_TOLERANCE_M or angle_rad > ROTATION_TOLERANCE_RAD:
         raise InvalidValueError(
-            f"q_start puts the pivot {distance_m * 1e3:.1f} mm and {np.rad2deg(angle_rad):.1f}° away from T_start; "
-            f"allowed is {POSITION_TOLERANCE_M * 1e3:.0f} mm and {np.rad2deg(ROTATION_TOLERANCE_RAD):.0f}°."
+            f"q_start puts the pivot {distance_m * 1e3:.1f} mm and {np.rad2deg(angle_rad):.1f}° from T_start; "
+            f"allowed is {POSITION_TOLERANCE_M * 1e3:.0f} mm and {np.rad2deg(ROTATION_TOLERANCE_RAD):.0f}°.",
+            code="start_pose",
         )
 
 
 def _check_inside(q: np.ndarray, s: np.ndarray) -> None:
-    """Refuse a spline that bulges over a limit between two waypoints that are inside."""
+    """Reject a spline that bulges over a limit between two waypoints that are inside."""
     excess = np.maximum(z1.Q_MIN - q, q - z1.Q_MAX)
     row, joint = np.unravel_index(int(excess.argmax()), excess.shape)
     if excess[row, joint] > _BULGE_RAD:

@@ -1,41 +1,54 @@
-"""From one frame to one plan: Algorithm 1 of MVB-Grasp up to the motion; each stage timed, nothing moves."""
+"""Algorithm 1 of MVB-Grasp: from one frame to one plan.
+
+`GraspSelector.select` is the whole algorithm; each of its lines is a stage with its own method, and nothing moves:
+
+    1. observe      frame → Observation        detect the object, cut its cloud, fit the table
+    2. generate     → GraspSet                 N grasps on the object's cloud
+    3. filter       → RankedGrasps             fit the box, keep the grasps that approach one of its k nearest faces
+    4. build_scene  → PlanningScene            everything the arm may hit, once for all stages after it
+    5. rank         → RankedCandidates         fit the gripper, order by what arm and gripper can do
+    6. plan         → GraspPlan                the first whose whole motion is feasible
+"""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from hal.base import z1
 from hal.base.clock import Stopwatch
-from hal.base.messages import Intrinsics, RgbdFrame
+from hal.base.messages import RgbdFrame
 from models.obb.mvbb import RankedGrasps, fit_obb, rank_grasps
 from models.types import GraspGenerator, GraspSet
+from z1_runtime.collision.planning_scene import PlanningScene
+from z1_runtime.collision.scene_collision import CollisionChecker
 from z1_runtime.config import RuntimeConfig, ranking_of
 from z1_runtime.geometry.kinematics import Kinematics
+from z1_runtime.grasping.beak_gripper import BeakGripper
+from z1_runtime.grasping.features import fit_upright_box
+from z1_runtime.grasping.grasp_candidates import GraspCandidates
 from z1_runtime.grasping.ranking import Ranking
-from z1_runtime.perception import extrinsics_check
-from z1_runtime.perception.detectors.ground_truth import GroundTruthDetector
-from z1_runtime.perception.errors import PerceptionError
 from z1_runtime.perception.segmentation import Perception
 from z1_runtime.planning.planner import GraspPlanner, NoPlanError
+from z1_runtime.planning.reachability import RankedCandidates, ReachabilityRanker
 from z1_runtime.types import GraspPlan, Observation
 
 _LOG = logging.getLogger(__name__)
 
 
 class StageTimes:
-    """Real milliseconds each stage took, by name, in the order the stages ended."""
+    """Real milliseconds of each stage, by name, in the order the stages ended."""
 
     def __init__(self) -> None:
         self.ms: dict[str, float] = {}
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Add the time the body takes to stage `name`."""
+        """Add the body's time to stage `name`."""
         watch = Stopwatch()
         try:
             yield
@@ -45,24 +58,26 @@ class StageTimes:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class GraspSelection:
-    """Everything between one frame and the motion it leads to."""
+    """Results of all stages between one frame and the motion it leads to."""
 
     observation: Observation
-    candidates: GraspSet
+    grasps: GraspSet
+    """All that the generator proposed."""
+    scene: PlanningScene
     ranked: RankedGrasps
     plan: GraspPlan
     stage_ms: dict[str, float]
-    """By stage: detect, cloud, generate, mvbb, rank, ik, collision, plan, and their total."""
+    """By stage: detect, cloud, generate, mvbb, collision, rank, ik, plan, and their total."""
 
 
 class GraspSelector:
-    """Sees, proposes, filters by the box, and plans.
+    """Selects and plans one grasp per frame.
 
     Args:
         kinematics: of the arm.
         perception: makes clouds of a frame.
         generator: proposes grasps.
-        planner: finds the first that the arm can do.
+        planner: finds the first with a feasible motion.
         config: the numbers of the algorithm.
         T_flange_camera: (4, 4) hand-eye transform.
 
@@ -86,35 +101,50 @@ class GraspSelector:
         self.planner = planner
         self.config = config
         self.ranking = ranking_of(config)
+        self.gripper = BeakGripper(planner.config.gripper)
         self.T_flange_camera = T_flange_camera
 
-    def decide(self, frame: RgbdFrame, q: np.ndarray) -> GraspSelection:
-        """Turn one frame, taken at joint positions `q` (7,), into a plan.
+    def select(self, frame: RgbdFrame, q: np.ndarray) -> GraspSelection:
+        """Return the plan of the best feasible grasp in one frame, taken at joint positions `q` (7,).
 
         Raises:
-            PerceptionError: nothing usable was seen.
+            PerceptionError: no usable object was observed.
             DegenerateCloudError: the object's cloud spans no box.
-            ValueError: the generator can make nothing of the cloud, such as an object wider than any opening.
-            NoPlanError: no candidate can be executed; the message counts why.
+            ValueError: the generator cannot use the cloud, such as an object wider than any opening.
+            NoPlanError: no candidate can be executed; the message counts the reasons.
         """
         times = StageTimes()
         with times.stage("total"):
             observation = self.observe(frame, q, times)
-            candidates, ranked, plan = self._choose(observation, q, times)
-        return GraspSelection(
-            observation=observation, candidates=candidates, ranked=ranked, plan=plan, stage_ms=dict(times.ms)
-        )
+            selection = self.select_from(observation, q, times)
+        return replace(selection, stage_ms=dict(times.ms))
 
-    def _choose(
-        self, observation: Observation, q: np.ndarray, times: StageTimes
-    ) -> tuple[GraspSet, RankedGrasps, GraspPlan]:
+    def select_from(self, observation: Observation, q: np.ndarray, times: StageTimes | None = None) -> GraspSelection:
+        """Return the plan of the best feasible grasp of `observation`; errors as `select`.
+
+        Args:
+            observation: one frame's clouds.
+            q: (7,) joints it was taken at, from which the motion starts [rad].
+            times: gets the stages.
+        """
+        times = times or StageTimes()
         with times.stage("generate"):
-            candidates = self.propose(observation)
+            grasps = self.generate(observation)
         with times.stage("mvbb"):
-            ranked = self._chosen_by_box(candidates, observation, self.ranking)
+            filtered = self.filter(grasps, observation)
+        with times.stage("collision"):
+            scene = self.build_scene(observation, q)
         with times.stage("rank"):
-            ranked = self._by_ability(ranked, observation, self.ranking)
-        return candidates, ranked, self.planner.plan(ranked.grasps, observation, q, times.stage)
+            best_first = self.rank(filtered, scene)
+        plan = self.planner.plan(best_first.candidates, q, times.stage)
+        return GraspSelection(
+            observation=observation,
+            grasps=grasps,
+            scene=scene,
+            ranked=best_first.ranked,
+            plan=plan,
+            stage_ms=dict(times.ms),
+        )
 
     def observe(self, frame: RgbdFrame, q: np.ndarray, times: StageTimes | None = None) -> Observation:
         """Return what `frame`, taken at joint positions `q` (7,), shows; `times` gets the stages detect and cloud.
@@ -130,89 +160,94 @@ class GraspSelector:
         with times.stage("cloud"):
             return self.perception.segment(filtered, T_base_camera, detection)
 
-    def propose(self, observation: Observation) -> GraspSet:
+    def generate(self, observation: Observation) -> GraspSet:
         """Return the generator's candidates for the object, in the camera frame.
 
         Raises:
-            ValueError: the generator can make nothing of the cloud.
+            ValueError: the generator cannot use the cloud.
         """
         return self.generator.sample(observation.object_points, self.config.n_candidates, self.config.seed)
 
-    def rank(self, candidates: GraspSet, observation: Observation, ranking: Ranking | None = None) -> RankedGrasps:
-        """Return the candidates that come at one of the nearest faces of the object's box, best first.
-
-        The box chooses, as in the paper; among those it lets pass the order is by what arm and gripper can do.
+    def filter(self, grasps: GraspSet, observation: Observation, ranking: Ranking | None = None) -> RankedGrasps:
+        """Return the grasps that approach one of the nearest faces of the object's box, and that box.
 
         Args:
-            candidates: camera frame.
+            grasps: camera frame.
             observation: the frame they were made from.
-            ranking: the numbers to do it by; None are the configuration's.
+            ranking: method of the box, faces and weights; the configured one if None.
 
         Raises:
             DegenerateCloudError: the object's cloud spans no box.
-            NoPlanError: none does.
+            NoPlanError: no grasp does.
         """
         ranking = ranking or self.ranking
-        return self._by_ability(self._chosen_by_box(candidates, observation, ranking), observation, ranking)
-
-    def _chosen_by_box(self, candidates: GraspSet, observation: Observation, ranking: Ranking) -> RankedGrasps:
-        up = observation.T_base_camera[2, :3]  # the base's z axis, seen from the camera
+        up = observation.T_base_camera[2, :3]  # the base's z axis in the camera frame
         box = fit_obb(observation.object_points, ranking.box_method, up=up)
-        ranked = rank_grasps(candidates, box, k=ranking.k_faces, alpha=ranking.alpha, hard_filter=ranking.hard_filter)
+        ranked = rank_grasps(grasps, box, k=ranking.k_faces, alpha=ranking.alpha, hard_filter=ranking.hard_filter)
         if not len(ranked):
             raise NoPlanError(
-                f"none of {len(candidates)} candidates comes at one of the {ranking.k_faces} nearest faces of the "
-                "object's box; raise k_faces or n_candidates, or look from another side.",
+                f"none of {len(grasps)} candidates approaches one of the {ranking.k_faces} nearest faces of the "
+                "object's box. Raise k_faces or n_candidates, or observe from another side.",
                 rejections=(),
+                code="no_face",
             )
         return ranked
 
-    def _by_ability(self, ranked: RankedGrasps, observation: Observation, ranking: Ranking) -> RankedGrasps:
-        assert ranked.box is not None
-        middle = ranked.box.T_camera_box[:3, 3]
-        return ranked.reordered(self.planner.ability(ranked.grasps, observation, middle, ranked.alignments, ranking))
+    def build_scene(self, observation: Observation, q: np.ndarray) -> PlanningScene:
+        """Return the surroundings in `observation`, taken at joints `q` (7,), without the robot itself.
 
-    def warm_up(self) -> None:
-        """Decide once on a drawn scene, so that the first real frame does not wait for compilers and caches."""
-        if self.config.perception.extrinsics_check.enabled:
-            extrinsics_check.warm_up()  # no jaws are in the drawn scene
-        q = np.append(z1.Q_HOME, self.config.jaw_home)
-        T_base_camera = self.kinematics.flange(z1.Q_HOME) @ self.T_flange_camera
-        frame = draw_can(T_base_camera)
-        (can,) = GroundTruthDetector().detect(frame, T_base_camera)
-        filtered = self.perception.filter_self(frame, self.config.jaw_home)
-        with suppress(PerceptionError):  # a colour detector finds no can in a black picture, but is warm then
-            self.perception.detect(filtered, T_base_camera)
-        try:
-            observation = self.perception.segment(filtered, T_base_camera, can)
-            self._choose(observation, q, StageTimes())
-        except (PerceptionError, NoPlanError) as error:  # impossible there may be possible here
-            _LOG.info("the warm-up scene has no plan under this configuration: %s", error)
+        Raises:
+            ValueError: a point is not finite.
+        """
+        return PlanningScene.from_observation(observation, q, self.kinematics, self.planner.config.collision)
 
+    def fit_candidates(
+        self,
+        grasps: GraspSet,
+        scene: PlanningScene,
+        *,
+        ranked: RankedGrasps | None = None,
+        ranking: Ranking | None = None,
+        chunk: int | None = None,
+    ) -> GraspCandidates:
+        """Return `grasps` (camera frame) as candidates that are fitted to the gripper once, when first needed.
 
-def draw_can(T_base_camera: np.ndarray, radius_m: float = 0.03, height_m: float = 0.15) -> RgbdFrame:
-    """Return an exact frame, from `T_base_camera` (4, 4), of an upright can 0.48 m in front of the base."""
-    intrinsics = Intrinsics(width=640, height=480, fx=393.0, fy=393.0, cx=319.5, cy=239.5)
-    d = intrinsics.rays() @ T_base_camera[:3, :3].T  # per metre of depth, in the base frame
-    eye = T_base_camera[:3, 3] - [0.48, 0.0, 0.0]
+        Args:
+            grasps: first to try first.
+            scene: their surroundings.
+            ranked: the ranking of these grasps, whose box is kept if `ranking` fitted it upright.
+            ranking: its numbers; the upright box is fitted here if its head needs it and `ranked` has none.
+            chunk: grasps that are fitted at once; None fits all of them.
 
-    with np.errstate(divide="ignore", invalid="ignore"):
-        table = np.where(d[..., 2] < 0, -eye[2] / d[..., 2], np.inf)
-        a = d[..., 0] ** 2 + d[..., 1] ** 2
-        b = d[..., 0] * eye[0] + d[..., 1] * eye[1]
-        side = (-b - np.sqrt(b**2 - a * (eye[0] ** 2 + eye[1] ** 2 - radius_m**2))) / a
-        side_z = eye[2] + side * d[..., 2]
-        side = np.where((side_z > 0) & (side_z < height_m), side, np.inf)
-        lid = np.where(d[..., 2] < 0, (height_m - eye[2]) / d[..., 2], np.inf)
-        lid_off = (eye[0] + lid * d[..., 0]) ** 2 + (eye[1] + lid * d[..., 1]) ** 2
-        lid = np.where(lid_off < radius_m**2, lid, np.inf)
-    depth = np.minimum(table, np.fmin(side, lid))
-    depth[~(depth < 1.5)] = 0.0
-    return RgbdFrame(
-        colour=np.zeros((*depth.shape, 3), np.uint8),
-        depth_m=depth,
-        intrinsics=intrinsics,
-        stamp_s=0.0,
-        sequence=0,
-        ground_truth_mask=np.fmin(side, lid) < table,
-    )
+        Raises:
+            DegenerateCloudError: the object's cloud spans no box.
+        """
+        box = None
+        if ranking is not None and ranking.box_method == "upright" and ranked is not None:
+            box = ranked.box
+        if box is None and ranking is not None and ranking.head is not None:
+            box = fit_upright_box(scene.observation)
+        return GraspCandidates.from_grasps(
+            grasps,
+            CollisionChecker(self.kinematics, scene),
+            self.gripper,
+            fallback_width_m=self.planner.config.fallback_width_m,
+            upright_box=box,
+            chunk=chunk,
+        )
+
+    def rank(self, filtered: RankedGrasps, scene: PlanningScene, ranking: Ranking | None = None) -> RankedCandidates:
+        """Return the grasps that the box let pass, ordered by what arm and gripper can do.
+
+        Args:
+            filtered: with the box that chose them.
+            scene: their surroundings.
+            ranking: head and thresholds; the configured one if None.
+
+        Raises:
+            DegenerateCloudError: the object's cloud spans no upright box.
+        """
+        ranking = ranking or self.ranking
+        candidates = self.fit_candidates(filtered.grasps, scene, ranked=filtered, ranking=ranking)
+        ranker = ReachabilityRanker(self.kinematics, CollisionChecker(self.kinematics, scene), self.planner.config)
+        return ranker.rank(filtered, candidates, ranking)

@@ -1,4 +1,4 @@
-"""One pick: look from home, decide, approach, close, lift, hold."""
+"""One pick: capture a frame from home, select a grasp, approach, close, lift, hold."""
 
 from __future__ import annotations
 
@@ -27,6 +27,8 @@ from z1_runtime.visualization.rerun_logger import RerunLogger
 
 _LOG = logging.getLogger(__name__)
 
+_AT_HOME_RAD = 1e-3  # an arm this near to home need not move; it is taken where it is
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Phase:
@@ -39,64 +41,69 @@ class Phase:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PickResult:
-    """What happened, for reports."""
+    """Outcome of one executed pick."""
 
-    decision: GraspSelection
-    phases: tuple[Phase, ...]
     held: bool
     """The jaws still hold something after the lift, by the gripper's own angle and torque."""
+    selection: GraspSelection
+    phases: tuple[Phase, ...]
     jaw: float
-    """Mover angle after the lift [rad]; 0 is closed on nothing."""
+    """Jaw angle after the lift [rad]; 0 is closed on nothing."""
     jaw_torque_nm: float
     """Gripper torque after the lift [Nm]."""
 
     @property
     def rejections(self) -> dict[str, int]:
-        """Candidates refused before the executed one, by reason."""
-        return dict(Counter(rejection.reason for rejection in self.decision.plan.rejections))
+        """Number of candidates that were tried and not taken, by reason."""
+        return dict(Counter(rejection.reason.value for rejection in self.selection.plan.rejections))
+
+    @property
+    def stage_ms(self) -> dict[str, float]:
+        """Real time of each stage of the selection [ms]."""
+        return self.selection.stage_ms
 
 
 class PickTask:
-    """Does picks with connected devices whose lease is held.
+    """Picks with connected devices whose lease is held.
 
     Args:
-        decider: turns a frame into a plan.
+        selector: selects and plans a grasp in a frame.
         arm: the servoed arm.
         camera: the wrist camera.
-        clock: the one both live by.
-        inspector: where everything is shown.
-        config: how a pick is done.
+        clock: of both devices.
+        logger: log of all stages.
+        config: speeds, times and thresholds of a pick.
         on_phase: called with each phase that ended well.
     """
 
     def __init__(
         self,
         *,
-        decider: GraspSelector,
+        selector: GraspSelector,
         arm: ServoedArm,
         camera: Camera,
         clock: Clock,
-        inspector: RerunLogger,
+        logger: RerunLogger,
         config: RuntimeConfig,
         on_phase: Callable[[Phase], None] = lambda _: None,
     ) -> None:
-        self.decider = decider
+        self.selector = selector
         self.arm = arm
         self.camera = camera
         self.clock = clock
-        self.inspector = inspector
+        self.logger = logger
         self.config = config
         self.on_phase = on_phase
         self.executor = Executor(arm, clock, config.executor)
-        self.executor.watchers.append(inspector.log_arm)
+        self.executor.watchers.append(logger.log_arm)
         self._motion = MotionLimits.at_speed(config.speed)
         self._phases: list[Phase] = []
 
     def pick(self) -> PickResult:
-        """Look, decide, and execute the grasp.
+        """Capture a frame, select a grasp, and execute it.
 
         Raises:
-            As `GraspSelector.decide`; and `MotionError`, `HalError` when the arm does not follow.
+            As `GraspSelector.select`; and `MotionError`, `HalError` when the arm does not follow.
         """
         self._phases.clear()
         with self._phase("home"):
@@ -105,14 +112,14 @@ class PickTask:
             state = self.executor.settle()
             frame = self.camera.wait_for_frame(self.config.frame_timeout_s)
         with self._phase("decide"):
-            decision = self.decider.decide(frame, state.q)
-        self._show(decision)
-        state = self._execute(decision.plan)
+            selection = self.selector.select(frame, state.q)
+        self._log(selection)
+        state = self._execute(selection.plan)
         jaw, torque = float(state.q[-1]), float(state.tau[-1])
         return PickResult(
-            decision=decision,
-            phases=tuple(self._phases),
             held=jaw < self.config.jaw_empty and abs(torque) > self.config.held_torque_nm,
+            selection=selection,
+            phases=tuple(self._phases),
             jaw=jaw,
             jaw_torque_nm=torque,
         )
@@ -120,27 +127,28 @@ class PickTask:
     def pick_until_held(self) -> PickResult:
         """Pick, and while the jaws hold nothing pick again from the scene as it then is, `attempts` times in all.
 
-        Returns the last pick that was executed: what a miss has pushed out of view or out of reach ends it too.
+        Returns the last pick that was executed: an object pushed out of view or out of reach ends the attempts too.
 
         Raises:
-            As `pick`, for the first attempt; later ones only what the arm or the HAL say.
+            As `pick`, for the first attempt; for later ones only errors of the arm or the HAL.
         """
-        record = self.pick()
+        result = self.pick()
         for attempt in range(2, self.config.attempts + 1):
-            if record.held:
+            if result.held:
                 break
             _LOG.info("the jaws closed on nothing; attempt %d of %d", attempt, self.config.attempts)
             try:
-                record = self.pick()
+                result = self.pick()
             except (PerceptionError, DegenerateCloudError, NoPlanError) as error:
                 _LOG.warning("no further attempt: %s", error)
                 break
-        return record
+        return result
 
     def _go_home(self) -> None:
+        # A command that the servo took from a measured state may be a hair beyond a limit
         q = np.clip(self.arm.status().q_command, z1.Q_MIN, z1.Q_MAX)
         q_home = np.append(z1.Q_HOME, self.config.jaw_home)
-        if np.abs(q - q_home).max() > 1e-3:
+        if np.abs(q - q_home).max() > _AT_HOME_RAD:
             self.executor.execute(joint_move(q, q_home, self._motion))
 
     def _execute(self, plan: GraspPlan) -> ArmState:
@@ -153,22 +161,22 @@ class PickTask:
             self.executor.execute(hold(plan.lift.q[-1], self.config.hold_s))
         return self.arm.read_state()
 
-    def _show(self, decision: GraspSelection) -> None:
-        observation, ranked = decision.observation, decision.ranked
-        self.inspector.log_observation(observation)
-        self.inspector.log_box(ranked.box, ranked.faces, observation.T_base_camera)
-        self.inspector.log_candidates(ranked.grasps, observation.T_base_camera)
-        self.inspector.log_plan(decision.plan)
-        self.inspector.log_stage_times(decision.stage_ms)
+    def _log(self, selection: GraspSelection) -> None:
+        observation, ranked = selection.observation, selection.ranked
+        self.logger.log_observation(observation)
+        self.logger.log_box(ranked.box, ranked.faces, observation.T_base_camera)
+        self.logger.log_candidates(ranked.grasps, observation.T_base_camera)
+        self.logger.log_plan(selection.plan)
+        self.logger.log_stage_times(selection.stage_ms)
 
     @contextmanager
     def _phase(self, name: str) -> Iterator[None]:
         start_s = self.clock.now_s()
-        self.inspector.log_phase(name, start_s)
+        self.logger.log_phase(name, start_s)
         try:
             yield
         except Exception:
-            self.inspector.log_phase(f"{name} failed", self.clock.now_s())
+            self.logger.log_phase(f"{name} failed", self.clock.now_s())
             raise
         phase = Phase(name=name, start_s=start_s, duration_s=self.clock.now_s() - start_s)
         self._phases.append(phase)

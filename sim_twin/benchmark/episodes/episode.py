@@ -18,11 +18,13 @@ from sim_twin.benchmark.episodes.rows import Attempt, Row, make_row
 from sim_twin.benchmark.episodes.scenarios import Scenario
 from sim_twin.benchmark.episodes.seen import SharedObservation
 from sim_twin.benchmark.episodes.trial import RETRIED, Mode, Outcome, Robot, look
+from z1_runtime.grasping.features import measure_features
 from z1_runtime.motion.executor import MotionError
 from z1_runtime.perception.errors import PerceptionError
 from z1_runtime.planning.planner import NoPlanError
+from z1_runtime.planning.reachability import RankedCandidates
 from z1_runtime.tasks.grasp_selection import GraspSelector, StageTimes
-from z1_runtime.types import Rejection
+from z1_runtime.types import Rejection, RejectionReason
 
 MakeDecider = Callable[[Scenario, int], GraspSelector]
 """Returns the runtime's decider for a scenario, with the generator's seed set to the second argument."""
@@ -143,26 +145,28 @@ def _decide(method: Method, decider: GraspSelector, seen: SharedObservation) -> 
     """Return the attempt that `method` would make; without a plan where there is none."""
     times = StageTimes()
     times.ms |= seen.times.ms
-    ranked = left = None
+    best_first = left = None
     try:
-        ranked, left = method.order(seen, decider, times)
-        plan = decider.planner.plan(ranked.grasps, seen.observation, seen.q, times.stage)
+        best_first, left = method.order(seen, decider, times)
+        plan = decider.planner.plan(best_first.candidates, seen.q, times.stage)
     except (DegenerateCloudError, NoPlanError) as error:
         rejections = error.rejections if isinstance(error, NoPlanError) else ()
         outcome = Outcome(mode=_why_no_plan(rejections), detail=str(error))
+        ranked = best_first and best_first.ranked
         attempt = Attempt(times=times, outcome=outcome, seen=seen, ranked=ranked, left=left, rejections=rejections)
     else:
+        ranked = best_first.ranked
         attempt = Attempt(times=times, seen=seen, ranked=ranked, left=left, plan=plan, rejections=plan.rejections)
-    return replace(attempt, features=_features(attempt, decider))
+    return replace(attempt, features=_features(attempt, best_first))
 
 
-def _features(attempt: Attempt, decider: GraspSelector) -> np.ndarray | None:
+def _features(attempt: Attempt, best_first: RankedCandidates | None) -> np.ndarray | None:
     """Return what a scoring head would go by (see `Attempt.features`), where something was ranked."""
-    if not attempt.ranked or attempt.seen is None:
+    if best_first is None or not len(best_first.candidates):
         return None
     of = [0, 0 if attempt.plan is None else attempt.plan.rank]
     try:
-        return decider.planner.features(attempt.ranked.grasps[np.array(of)], attempt.seen.observation)
+        return measure_features(best_first.candidates.reordered(np.array(of)))
     except DegenerateCloudError:  # a method that fits no box goes on without one
         return None
 
@@ -170,6 +174,6 @@ def _features(attempt: Attempt, decider: GraspSelector) -> np.ndarray | None:
 def _why_no_plan(rejections: Sequence[Rejection]) -> Mode:
     """Return the stage at which the candidate that came furthest was refused."""
     reasons = {rejection.reason for rejection in rejections}
-    if "path" in reasons or "self" in reasons:
+    if reasons & {RejectionReason.PATH, RejectionReason.SELF}:
         return Mode.NO_PATH
-    return Mode.NO_IK if "ik" in reasons else Mode.NO_CANDIDATE
+    return Mode.NO_IK if RejectionReason.IK in reasons else Mode.NO_CANDIDATE

@@ -10,9 +10,11 @@ import numpy as np
 
 from hal.base.errors import InvalidValueError
 from models.obb.mvbb import FitMethod, RankedGrasps, fit_obb, rank_by_score, rank_grasps
-from models.types import GraspSet
 from sim_twin.benchmark.episodes.seen import SharedObservation
+from z1_runtime.grasping.features import fit_upright_box, measure_features
+from z1_runtime.grasping.grasp_candidates import EARLY_EXIT_CHUNK
 from z1_runtime.grasping.ranking import Ranking, ScoringHead, load_scoring
+from z1_runtime.planning.reachability import RankedCandidates
 from z1_runtime.tasks.grasp_selection import GraspSelector, StageTimes
 
 
@@ -56,46 +58,65 @@ class Method:
 
     def order(
         self, seen: SharedObservation, decider: GraspSelector, times: StageTimes
-    ) -> tuple[RankedGrasps, np.ndarray]:
+    ) -> tuple[RankedCandidates, np.ndarray]:
         """Return the candidates in the order to try them, and which (M,) were left before the ranking.
 
         The ranking's own indices count in those that were left.
 
         Args:
-            seen: the look, with its candidates.
+            seen: the observation, with its candidates.
             decider: whose kinematics, gripper and box settings are used.
-            times: gets the stages `filter` (of collisions) and `rank` (fit, filter by the box, score).
+            times: gets the stages `collision` (the scene), `filter` (of collisions) and `rank` (fit, filter by the
+                box, score).
 
         Raises:
             DegenerateCloudError: the object's cloud spans no box.
             NoPlanError: `full` keeps none.
         """
-        left = np.arange(len(seen.candidates))
-        if self.rank_by != "full" and self.collision_filter:
-            left = np.flatnonzero(seen.free(decider, times))
-        with times.stage("rank"):
-            return self._rank(seen.candidates[left], seen, decider), left
-
-    def _rank(self, candidates: GraspSet, seen: SharedObservation, decider: GraspSelector) -> RankedGrasps:
+        scene = seen.scene(decider, times)
         if self.rank_by == "full":
-            return decider.rank(candidates, seen.observation, self.ranking(decider.ranking))
+            ranking = self.ranking(decider.ranking)
+            with times.stage("rank"):
+                filtered = decider.filter(seen.candidates, seen.observation, ranking)
+                return decider.rank(filtered, scene, ranking), np.arange(len(seen.candidates))
+        fitted = seen.fitted(decider, times) if self.collision_filter else None
+        left = np.arange(len(seen.candidates)) if fitted is None else np.flatnonzero(fitted.free())
+        with times.stage("rank"):
+            ranked, ranking = self._rank_left(seen, left)
+            if fitted is not None:
+                candidates = fitted.reordered(left[ranked.indices])
+            else:
+                candidates = decider.fit_candidates(ranked.grasps, scene, chunk=EARLY_EXIT_CHUNK)
+            if ranking is None:
+                return RankedCandidates(ranked=ranked, candidates=candidates), left
+            return _order_by(ranking, RankedCandidates(ranked=ranked, candidates=candidates)), left
+
+    def _rank_left(self, seen: SharedObservation, left: np.ndarray) -> tuple[RankedGrasps, Ranking | None]:
+        """Return the candidates `left` (M,) by score, or by the paper's box and then with the ranking of that box."""
+        grasps = seen.candidates[left]
         if self.rank_by == "score":
-            return rank_by_score(candidates)
-        return _rank_by_box(candidates, seen, decider, self.ranking(Ranking()))
+            return rank_by_score(grasps), None
+        ranking, observation = self.ranking(Ranking()), seen.observation
+        box = fit_obb(observation.object_points, ranking.box_method, up=observation.T_base_camera[2, :3])
+        return rank_grasps(
+            grasps, box, k=ranking.k_faces, alpha=ranking.alpha, hard_filter=ranking.hard_filter
+        ), ranking
 
 
-def _rank_by_box(
-    candidates: GraspSet, seen: SharedObservation, decider: GraspSelector, ranking: Ranking
-) -> RankedGrasps:
-    """Return the paper's order, or with a head the head's; what is below a threshold comes last."""
-    observation = seen.observation
-    box = fit_obb(observation.object_points, ranking.box_method, up=observation.T_base_camera[2, :3])
-    ranked = rank_grasps(candidates, box, k=ranking.k_faces, alpha=ranking.alpha, hard_filter=ranking.hard_filter)
+def _order_by(ranking: Ranking, by_box: RankedCandidates) -> RankedCandidates:
+    """Return the paper's order, or with a head the head's; candidates below a threshold come last."""
+    ranked, candidates = by_box.ranked, by_box.candidates
+    if ranking.box_method == "upright":
+        candidates = replace(candidates, upright_box=ranked.box)
+    elif ranking.head is not None and len(ranked):
+        candidates = replace(candidates, upright_box=fit_upright_box(candidates.scene.observation))
     scores = ranked.scores
     if ranking.head is not None and len(ranked):
-        scores = ranking.head.probability(decider.planner.features(ranked.grasps, observation))
-    wanted = ranking.wanted(ranked.alignments, ranked.grasps.scores)
-    return ranked.reordered(np.where(wanted, scores, scores - _BEHIND))
+        scores = ranking.head.probability(measure_features(candidates))
+    passes = ranking.passes_thresholds(ranked.alignments, ranked.grasps.scores)
+    scores = np.where(passes, scores, scores - _BEHIND)
+    order = np.argsort(-scores, kind="stable")  # as `RankedGrasps.reordered` sorts
+    return RankedCandidates(ranked=ranked.reordered(scores), candidates=candidates.reordered(order))
 
 
 _BEHIND = 2.0

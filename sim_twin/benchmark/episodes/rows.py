@@ -18,13 +18,10 @@ from sim_twin.benchmark.episodes.targeting import overlap
 from sim_twin.benchmark.episodes.trial import Mode, Outcome
 from z1_runtime.grasping.features import FEATURES
 from z1_runtime.tasks.grasp_selection import StageTimes
-from z1_runtime.types import GraspPlan, Rejection
+from z1_runtime.types import GraspPlan, Rejection, RejectionReason
 
 Row = dict[str, Any]
 """One episode: column to value, as `make_row` says. A column that does not apply is missing, in the table None."""
-
-REASONS = ("width", "table", "scene", "object", "self", "ik", "path")
-"""For which the planner refuses a candidate; each has a column `rejected_…`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -88,7 +85,7 @@ def make_row(
     row |= asdict(last.ended) | {"mode": last.ended.mode.value}
     row |= {f"{stage}_ms": ms for stage, ms in last.times.ms.items()}
     reasons = Counter(rejection.reason for rejection in last.rejections)
-    row |= {f"rejected_{reason}": reasons[reason] for reason in REASONS}
+    row |= {f"rejected_{reason}": reasons[reason] for reason in RejectionReason}
     row |= _of_look(last.seen) | _of_ranking(last) | _of_plan(last) | _of_features(last)
     return row if qpos is None else row | {"final_qpos": qpos.tolist()}
 

@@ -145,7 +145,8 @@ def make_grasp_selector(config: RuntimeConfig, scenario: Scenario, seed: int) ->
 @cache
 def _assembled(config: RuntimeConfig) -> GraspSelector:
     from z1_runtime.factory import make_grasp_selector
+    from z1_runtime.tasks.warm_up import warm_up_selector
 
     decider = make_grasp_selector(config)
-    decider.warm_up()
+    warm_up_selector(decider)
     return decider

@@ -6,7 +6,7 @@ import numpy as np
 
 from hal.base.messages import RgbdFrame
 from models.types import GraspSet
-from z1_runtime.collision.scene_collision import CollisionChecker
+from z1_runtime.collision.planning_scene import PlanningScene
 from z1_runtime.grasping.grasp_candidates import GraspCandidates
 from z1_runtime.tasks.grasp_selection import GraspSelector, StageTimes
 from z1_runtime.types import Observation
@@ -29,7 +29,9 @@ class SharedObservation:
         self.frame, self.q = frame, q
         self.observation, self.candidates = observation, candidates
         self.times = times
-        self._free: np.ndarray | None = None
+        self._scene: PlanningScene | None = None
+        self._scene_times = StageTimes()
+        self._fitted: GraspCandidates | None = None
         self._filter_times = StageTimes()
 
     @classmethod
@@ -42,24 +44,26 @@ class SharedObservation:
         """
         observation = decider.observe(frame, q, times)
         with times.stage("generate"):
-            candidates = decider.propose(observation)
+            candidates = decider.generate(observation)
         return cls(frame, q, observation, candidates, times)
 
-    def free(self, decider: GraspSelector, times: StageTimes) -> np.ndarray:
-        """Return (N,) which candidates the beak can be laid around without hitting a point that was seen.
+    def scene(self, decider: GraspSelector, times: StageTimes) -> PlanningScene:
+        """Return the planning scene, built for the first method that needs it; `times` of each gets its `collision`."""
+        if self._scene is None:
+            with self._scene_times.stage("collision"):
+                self._scene = decider.build_scene(self.observation, self.q)
+        times.ms |= self._scene_times.ms
+        return self._scene
 
-        It is computed for the first method that asks, and its time is told to each: `times` gets the stage `filter`.
+    def fitted(self, decider: GraspSelector, times: StageTimes) -> GraspCandidates:
+        """Return all candidates fitted to the gripper, for the first method that needs them.
+
+        `times` of each method gets the stage `filter`.
         """
-        if self._free is None:
+        scene = self.scene(decider, times)
+        if self._fitted is None:
             with self._filter_times.stage("filter"):
-                planner = decider.planner
-                checker = CollisionChecker(decider.kinematics, self.observation, self.q, planner.config.collision)
-                self._free = GraspCandidates(
-                    self.candidates,
-                    self.observation.T_base_camera,
-                    planner.gripper,
-                    checker,
-                    fallback_width_m=planner.config.fallback_width_m,
-                ).free()
+                self._fitted = decider.fit_candidates(self.candidates, scene)
+                self._fitted.free()
         times.ms |= self._filter_times.ms
-        return self._free
+        return self._fitted

@@ -18,24 +18,26 @@ from sim_twin.model.objects import OBJECTS
 from sim_twin.model.scene import SceneConfig
 from sim_twin.model.world import GRIPPER_START_RAD
 from z1_runtime.collision import scene_collision
-from z1_runtime.collision.scene_collision import CollisionChecker, CollisionConfig
-from z1_runtime.collision.self_collision import Problem
+from z1_runtime.collision.collision_config import CollisionConfig
+from z1_runtime.collision.planning_scene import PlanningScene
+from z1_runtime.collision.scene_collision import CollisionChecker
 from z1_runtime.geometry.gripper_geometry import BeakConfig
 from z1_runtime.geometry.kinematics import Kinematics
 from z1_runtime.grasping import width_estimation
-from z1_runtime.grasping.beak_gripper import BeakGripper
-from z1_runtime.grasping.grasp_candidates import GraspCandidates, GripperPlacement
+from z1_runtime.grasping.beak_gripper import BeakGripper, GripperPlacement
+from z1_runtime.grasping.grasp_candidates import GraspCandidates
 from z1_runtime.motion.trajectory import MotionLimits
 from z1_runtime.planning.pick_motion import PickMotionPlanner
+from z1_runtime.planning.planner import make_plan
 from z1_runtime.planning.planner_config import PlannerConfig
 from z1_runtime.planning.reachability import ReachabilityRanker
-from z1_runtime.types import GraspPlan, Observation, Plane
+from z1_runtime.types import GraspPlan, Observation, Plane, Rejection, RejectionReason
 
 EXACT_PLANNER = PlannerConfig(
     short_standoff_m=0.04,
     max_branches=8,
     # The jaws' rubber has a friction of 1.0 in the twin, and no side of the object is unseen
-    beak=BeakConfig(unseen_m=0.0, friction=0.8),
+    gripper=BeakConfig(unseen_m=0.0, friction=0.8),
     collision=CollisionConfig(
         scene_threshold_m=0.001,
         object_threshold_m=0.002,
@@ -59,9 +61,6 @@ class Option:
     """One grasp, one flip, that the arm can go."""
 
     way: GripperPlacement
-    width_m: float
-    jaw_contact: float
-    """Mover angle at which it is touched [rad]."""
 
 
 class Options:
@@ -137,9 +136,10 @@ class TrueScene:
         self._planner = planner
         self._surface, self._T_base_object = Surface(scene.thing), scene.T_base_object()
         self._middle = self._T_base_object[:3, 3]
-        self._gripper = BeakGripper(planner.beak)
+        self._gripper = BeakGripper(planner.gripper)
         q_home = np.append(z1.Q_HOME, GRIPPER_START_RAD)
-        self._checker = CollisionChecker(kinematics, self._observation(scene), None, planner.collision)
+        surroundings = PlanningScene.from_observation(self._observation(scene), None, kinematics, planner.collision)
+        self._checker = CollisionChecker(kinematics, surroundings)
         self._motions = PickMotionPlanner(
             kinematics,
             self._checker,
@@ -152,61 +152,38 @@ class TrueScene:
     def options(self, sweep: SweepConfig) -> Options:
         """Return the ways that hit nothing and that the arm can go, of the grasps of `sweep`."""
         planner = self._planner
-        grasps = sweep_grasps(self._surface, self._T_base_object, planner.beak.contact_depth_m, sweep)
-        candidates = GraspCandidates(
-            grasps,
-            np.eye(4),
-            self._gripper,
-            self._checker,
-            fallback_width_m=planner.fallback_width_m,
-            chunk=len(grasps),
+        grasps = sweep_grasps(self._surface, self._T_base_object, planner.gripper.contact_depth_m, sweep)
+        candidates = GraspCandidates.from_grasps(
+            grasps, self._checker, self._gripper, fallback_width_m=planner.fallback_width_m
         )
-        ranking = ReachabilityRanker(self.kinematics, self._checker, candidates, planner)
+        ranker = ReachabilityRanker(self.kinematics, self._checker, planner)
         rejected: Counter[str] = Counter()
-        found, ranks, eases, n_clear = [], [], [], 0
+        found, ranks, scores, n_clear = [], [], [], 0
         for rank in range(len(candidates)):
-            ways = candidates.ways(rank)
-            if isinstance(ways, Problem):
-                rejected[ways.reason] += 1
+            placed = candidates.placements(rank)
+            if placed.rejection is not None:
+                rejected[placed.rejection.reason] += 1
                 continue
             n_clear += 1
-            gone = [(way, ease) for way in ways if (ease := ranking.ease(way))]
-            rejected["ik"] += not gone
-            for way, ease in gone:
-                found.append(
-                    Option(way=way, width_m=float(candidates.widths_m[rank]), jaw_contact=candidates.jaw_contact(rank))
-                )
+            gone = [(way, score) for way in placed.placements if (score := ranker.manipulability(way))]
+            rejected[RejectionReason.IK] += not gone
+            for way, score in gone:
+                found.append(Option(way=way))
                 ranks.append(rank)
-                eases.append(ease)
-        worth = ranking.quality(self._middle, grasps.scores, np.zeros(len(grasps)))
+                scores.append(score)
+        worth = ranker.quality(candidates, self._middle, np.zeros(len(grasps)))
         return Options(
             found,
-            worth[np.array(ranks, dtype=int)] + planner.ability.ease * np.array(eases),
+            worth[np.array(ranks, dtype=int)] + planner.reachability.manipulability * np.array(scores),
             n_candidates=len(grasps),
             n_clear=n_clear,
             rejected=rejected,
         )
 
-    def plan(self, option: Option) -> GraspPlan:
-        """Return the whole motion of `option`.
-
-        Raises:
-            CandidateRejected: it cannot be gone after all.
-        """
-        way, motion = self._motions.first_motion([option.way])
-        return GraspPlan(
-            rank=0,
-            T_base_grasp=way.T_base_grasp,
-            width_m=option.width_m,
-            T_base_pivot=way.T_base_pivot,
-            jaw_open=way.jaw_open,
-            jaw_contact=option.jaw_contact,
-            transfer=motion.transfer,
-            approach=motion.approach,
-            close=motion.close,
-            lift=motion.lift,
-            rejections=(),
-        )
+    def plan(self, option: Option) -> GraspPlan | Rejection:
+        """Return the whole motion of `option`, or the rejection of it."""
+        motion = self._motions.plan_first([option.way])
+        return motion if isinstance(motion, Rejection) else make_plan(motion)
 
     def _observation(self, scene: SceneConfig) -> Observation:
         """Return the scene as if it had been seen from all sides at once; its camera frame is the base frame."""

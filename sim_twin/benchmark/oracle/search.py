@@ -14,15 +14,14 @@ from importlib.metadata import version
 
 from hal.base.clock import Stopwatch
 from hal.base.errors import InvalidValueError
-from sim_twin.benchmark.episodes.rows import REASONS, Row
+from sim_twin.benchmark.episodes.rows import Row
 from sim_twin.benchmark.episodes.scenarios import Scenario
 from sim_twin.benchmark.episodes.trial import Mode, Outcome, Robot
 from sim_twin.benchmark.oracle.candidates import SweepConfig
 from sim_twin.benchmark.oracle.options import EXACT_PLANNER, Options, TrueScene
 from z1_runtime.geometry.kinematics import Kinematics
-from z1_runtime.planning.pick_motion import CandidateRejected
 from z1_runtime.planning.planner_config import PlannerConfig
-from z1_runtime.types import GraspPlan
+from z1_runtime.types import GraspPlan, Rejection, RejectionReason
 
 METHOD = "oracle"
 
@@ -111,10 +110,9 @@ class _Hunt:
             if choice is None:
                 options, finer = options.joined(self._truth.options(self._config.finer)), True
                 continue
-            try:
-                plan = self._truth.plan(choice)
-            except CandidateRejected as refusal:
-                self._refused[refusal.reason] += 1
+            plan = self._truth.plan(choice)
+            if isinstance(plan, Rejection):
+                self._refused[plan.reason] += 1
                 options.fail(choice)
                 continue
             outcome = self._execute(plan)
@@ -148,7 +146,7 @@ class _Hunt:
             "n_clear": counted.n_clear,
             "n_reachable": len(counted),
         }
-        row |= {f"rejected_{reason}": counted.rejected[reason] + self._refused[reason] for reason in REASONS}
+        row |= {f"rejected_{reason}": counted.rejected[reason] + self._refused[reason] for reason in RejectionReason}
         if self._last is None:
             return row
         plan, outcome = self._last

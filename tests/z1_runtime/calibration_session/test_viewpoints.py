@@ -121,7 +121,7 @@ def test_board_out_of_reach_is_rejected_with_counted_reasons(kinematics, checker
 def test_obstacles_on_the_table_are_avoided(kinematics, checker):
     box = (np.array([0.50, -0.20, 0.0]), np.array([0.60, 0.20, 0.30]))
     walled = scan_scene(kinematics, frame_from_home(kinematics, box), HOME)
-    assert len(walled.scene_index) > 100 and len(checker.scene_index) == 0
+    assert len(walled.scene.scene_index) > 100 and len(checker.scene.scene_index) == 0
     T_pivot = np.eye(4)
     T_pivot[:3, 3] = [0.50, 0.0, 0.25]  # the tips reach 0.1 m beyond: into the box
     q = np.append(kinematics.best(T_pivot).q, 0.0)

@@ -1,14 +1,17 @@
-"""The beak's mapping, held against the STL meshes."""
+"""The gripper's fit to a width, compared with the STL meshes."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from hal.base import z1
 from hal.base.transforms import inverse
 from hal.base.z1_gripper import JAW_REACH_M, KNEE_RADIUS_M, MOVING_FACE, STATIONARY_FACE, moving_jaw_pose
+from tests.support.errors import raises
 from z1_runtime.geometry.gripper_geometry import BeakConfig
 from z1_runtime.grasping.beak_gripper import BeakGripper, WidthError
 
@@ -42,7 +45,7 @@ def lateral_gaps(T_base_pivot: np.ndarray, jaw: float, stator: np.ndarray, mover
 
 
 def without_palm(stator: np.ndarray) -> np.ndarray:
-    """Return the fixed jaw's points before the palm, which has a clearance of its own."""
+    """Return the stationary jaw's points before the palm, which has a clearance of its own."""
     return stator[stator[:, 0] > 0.045]
 
 
@@ -54,21 +57,21 @@ def contact_frame(config: BeakConfig) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("face", "name", "offset"), [(STATIONARY_FACE, "stator", 0.0), (MOVING_FACE, "mover", 0.0)])
-def test_the_measured_faces_lie_on_the_meshes(face, name, offset, request):
+def test_the_measured_faces_are_on_the_meshes(face, name, offset, request):
     points = request.getfixturevalue(name)
     middle = points[np.abs(points[:, 1]) < 0.02][:, [0, 2]]
     nearest = np.linalg.norm(face[:, None] - middle, axis=2).min(axis=1)
     assert nearest.max() < 0.0015
 
 
-def test_knees_and_tips_are_where_the_faces_say():
+def test_knees_and_tips_agree_with_the_faces():
     assert np.hypot(*MOVING_FACE[1]) == pytest.approx(KNEE_RADIUS_M, abs=1e-3)
     assert np.hypot(*STATIONARY_FACE[1]) == pytest.approx(KNEE_RADIUS_M, abs=1.5e-3)
     assert STATIONARY_FACE[0, 0] == MOVING_FACE[0, 0] == JAW_REACH_M
 
 
 @pytest.mark.parametrize("width", [0.01, 0.02, 0.03, 0.04, 0.05, 0.06, 0.07, 0.08])
-def test_both_jaws_touch_a_round_object_of_the_asked_width(width, stator, mover):
+def test_both_jaws_touch_a_round_object_of_that_width(width, stator, mover):
     for grasp in BeakGripper(TIGHT).fit(contact_frame(TIGHT), width):
         gaps = lateral_gaps(grasp.T_base_pivot, grasp.jaw_contact, stator, mover, 0.5 * width)
         assert np.abs(gaps).max() < 0.0015, gaps
@@ -83,7 +86,7 @@ def test_while_approaching_both_jaws_keep_their_clearance(width, stator, mover):
 
 
 @pytest.mark.parametrize("width", [0.02, 0.04, 0.06, 0.08])
-def test_while_closing_the_hand_turns_so_that_both_jaws_arrive_together(width, stator, mover):
+def test_while_closing_the_gripper_turns_so_that_both_jaws_arrive_together(width, stator, mover):
     config = BeakConfig()
     for grasp in BeakGripper(config).fit(contact_frame(config), width):
         assert grasp.T_base_touch[:3, 3] == pytest.approx(grasp.T_base_pivot[:3, 3], abs=1e-12)
@@ -93,7 +96,7 @@ def test_while_closing_the_hand_turns_so_that_both_jaws_arrive_together(width, s
         assert grasp.jaw_open < grasp.jaw_contact < grasp.jaw_touch < 0.0
 
 
-def test_the_flips_put_the_fixed_jaw_on_opposite_sides():
+def test_the_flips_put_the_stationary_jaw_on_opposite_sides():
     plain, flipped = BeakGripper().fit(np.eye(4), 0.05)
     sides = [T_base_pivot[:3, 2] @ [0.0, 1.0, 0.0] for T_base_pivot in (plain.T_base_pivot, flipped.T_base_pivot)]
     assert sides[0] > 0.9
@@ -111,22 +114,24 @@ def test_the_fingertips_pass_the_contacts_and_the_squeeze_is_level(width):
     assert abs(gripper.squeeze_out_angle(width)) < np.deg2rad(12)
 
 
-def test_a_width_beyond_the_friction_cone_is_refused_with_figures():
+def test_a_width_beyond_the_friction_cone_is_rejected_with_figures():
     gripper = BeakGripper()
     assert 0.075 < gripper.max_width_m < 0.095
     gripper.fit(np.eye(4), gripper.max_width_m)
-    with pytest.raises(WidthError, match=r"100 mm wide.*up to 84 mm"):
+    with raises(WidthError, "width") as caught:
         gripper.fit(np.eye(4), 0.100)
+    assert "100 mm wide" in str(caught.value)
+    assert "up to 84 mm" in str(caught.value)
     assert BeakGripper(BeakConfig(friction=0.2)).max_width_m < gripper.max_width_m - 0.005
 
 
 @pytest.mark.parametrize("width", [0.0, -0.01, float("nan")])
-def test_a_width_that_is_no_width_is_refused(width):
-    with pytest.raises(WidthError, match="positive number"):
+def test_a_width_that_is_not_positive_is_rejected(width):
+    with raises(WidthError, "width"):
         BeakGripper().fit(np.eye(4), width)
 
 
-def test_a_deep_object_is_held_nearer_its_front_and_a_deeper_one_refused(stator):
+def test_a_deep_object_is_held_nearer_its_front_and_a_deeper_one_rejected(stator):
     config = BeakConfig()
     gripper = BeakGripper(config)
     shallow, _ = gripper.fit(contact_frame(config), 0.04, 0.02)
@@ -135,7 +140,7 @@ def test_a_deep_object_is_held_nearer_its_front_and_a_deeper_one_refused(stator)
     assert back_m == pytest.approx(0.020, abs=0.005)
     palm = stator[np.hypot(stator[:, 0], stator[:, 2]) < 0.034] @ deep.T_base_pivot[:3, :3].T + deep.T_base_pivot[:3, 3]
     assert palm[:, 2].max() < -0.055
-    with pytest.raises(WidthError, match="reaches 90 mm"):
+    with raises(WidthError, "width"):
         gripper.fit(np.eye(4), 0.04, 0.090)
 
 
@@ -149,3 +154,11 @@ def test_the_mapping_moves_with_the_grasp():
     for a, b in zip(here, there, strict=True):
         assert inverse(T) @ b.T_base_pivot == pytest.approx(a.T_base_pivot, abs=1e-12)
         assert np.linalg.det(b.T_base_pivot[:3, :3]) == pytest.approx(1.0)
+
+
+@settings(max_examples=200)
+@given(st.floats(1e-4, 0.2), st.floats(-0.02, 0.12))
+def test_every_jaw_angle_is_inside_the_limits(width_m, front_m):
+    fits = BeakGripper().fit_batch(np.eye(4)[None], np.array([width_m]), np.array([front_m]))
+    for angles in (fits.jaw_open, fits.jaw_contact, fits.jaw_touch):
+        assert z1.GRIPPER_OPEN <= angles[0] <= z1.GRIPPER_CLOSED

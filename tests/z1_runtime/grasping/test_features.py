@@ -1,4 +1,4 @@
-"""What is measured of a grasp is what a ruler would say; and a fitted head orders the runtime's grasps."""
+"""Features of grasps of known geometry, and a fitted head that orders the runtime's grasps."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hal.base import z1
-from hal.base.transforms import inverse
+from tests.support.errors import raises
 from tests.support.tabletop_scenes import (
     HEIGHT_M,
     RADIUS_M,
@@ -16,15 +16,19 @@ from tests.support.tabletop_scenes import (
     cylinder,
     frontal,
     in_camera,
+    make_candidates,
+    make_checker,
     make_observation,
 )
 from z1_runtime.config import RuntimeConfig
 from z1_runtime.factory import make_grasp_selector
 from z1_runtime.geometry.kinematics import Kinematics
-from z1_runtime.grasping.features import FEATURES
+from z1_runtime.grasping.features import FEATURES, fit_upright_box, measure_features
 from z1_runtime.grasping.ranking import Ranking, Scoring, ScoringError, ScoringHead, save_scoring
-from z1_runtime.planning.planner import GraspPlanner
-from z1_runtime.tasks.grasp_selection import GraspSelector, draw_can
+from z1_runtime.planning.planner_config import PlannerConfig
+from z1_runtime.planning.reachability import ReachabilityRanker
+from z1_runtime.tasks.grasp_selection import GraspSelector
+from z1_runtime.tasks.warm_up import draw_can
 from z1_runtime.types import Observation
 
 AT = (0.46, 0.08)
@@ -34,19 +38,22 @@ HIGHER_IS_BETTER = ScoringHead(features=("above_m",), mean=(0.0,), scale=(0.03,)
 
 
 @pytest.fixture(scope="module")
-def planner() -> GraspPlanner:
-    return GraspPlanner(Kinematics())
+def kinematics() -> Kinematics:
+    return Kinematics()
 
 
 @pytest.fixture(scope="module")
-def observation(planner) -> Observation:
-    T_base_camera = camera_pose(planner._kinematics)
+def observation(kinematics) -> Observation:
+    T_base_camera = camera_pose(kinematics)
     return make_observation(T_base_camera, cylinder(*AT, T_base_camera[:3, 3]))
 
 
-def test_a_grasp_is_measured_as_by_a_ruler(planner, observation):
-    grasps = in_camera(observation.T_base_camera, [LOW, HIGH])
-    low, high = (dict(zip(FEATURES, row, strict=True)) for row in planner.features(grasps, observation))
+def features(kinematics: Kinematics, observation: Observation, poses: list[np.ndarray]) -> np.ndarray:
+    return measure_features(make_candidates(kinematics, in_camera(observation.T_base_camera, poses), observation))
+
+
+def test_the_features_are_the_distances_of_the_scene(kinematics, observation):
+    low, high = (dict(zip(FEATURES, row, strict=True)) for row in features(kinematics, observation, [LOW, HIGH]))
     assert low["generator"] == 1.0
     assert low["down"] == pytest.approx(np.sin(PITCH_RAD), abs=1e-3)
     assert low["outward"] == pytest.approx(np.cos(PITCH_RAD), abs=1e-3)
@@ -54,59 +61,60 @@ def test_a_grasp_is_measured_as_by_a_ruler(planner, observation):
     assert low["height_m"] == pytest.approx(0.075, abs=1e-3)
     assert low["width_m"] == pytest.approx(2 * RADIUS_M, abs=0.012)
     assert low["above_m"] == pytest.approx(0.0, abs=0.006)
-    assert low["away_m"] < 0.02
+    assert low["distance_to_centre_m"] < 0.02
     assert high["above_m"] - low["above_m"] == pytest.approx(HEIGHT_M - 0.095, abs=1e-6)
     assert low["support"] > 0.9
     assert low["alignment"] > 0.8
 
 
-def test_what_is_measured_does_not_depend_on_the_grasps_beside_it(planner, observation):
-    both = planner.features(in_camera(observation.T_base_camera, [LOW, HIGH]), observation)
-    alone = planner.features(in_camera(observation.T_base_camera, [HIGH]), observation)
+def test_features_do_not_depend_on_the_other_grasps(kinematics, observation):
+    both = features(kinematics, observation, [LOW, HIGH])
+    alone = features(kinematics, observation, [HIGH])
     assert alone[0] == pytest.approx(both[1], abs=1e-12)
 
 
-def worth(planner, observation, ranking: Ranking | None, alignments=(1.0, 1.0)) -> np.ndarray:
-    middle = inverse(observation.T_base_camera) @ [*AT, HEIGHT_M / 2, 1.0]
+def score(kinematics, observation, ranking: Ranking | None, alignments=(1.0, 1.0)) -> np.ndarray:
     grasps = in_camera(observation.T_base_camera, [LOW, HIGH])
-    return planner.ability(grasps, observation, middle[:3], np.array(alignments), ranking)
+    candidates = make_candidates(kinematics, grasps, observation, chunk=None)
+    ranker = ReachabilityRanker(kinematics, make_checker(kinematics, observation), PlannerConfig())
+    return ranker.scores(candidates, fit_upright_box(observation), np.array(alignments), ranking)
 
 
-def test_a_head_stands_for_the_weights_among_what_the_arm_can_reach(planner, observation):
-    low, high = worth(planner, observation, None)
+def test_a_head_replaces_the_weights_among_reachable_grasps(kinematics, observation):
+    low, high = score(kinematics, observation, None)
     assert low > high > 2.0
-    low, high = worth(planner, observation, Ranking(head=HIGHER_IS_BETTER))
+    low, high = score(kinematics, observation, Ranking(head=HIGHER_IS_BETTER))
     assert high > low > 2.0
 
 
-def test_a_ranking_without_head_and_thresholds_changes_nothing(planner, observation):
-    assert worth(planner, observation, Ranking()).tolist() == worth(planner, observation, None).tolist()
+def test_a_ranking_without_head_and_thresholds_changes_nothing(kinematics, observation):
+    assert score(kinematics, observation, Ranking()).tolist() == score(kinematics, observation, None).tolist()
 
 
-def test_what_is_below_a_threshold_comes_last_but_is_not_lost(planner, observation):
-    low, high = worth(planner, observation, Ranking(min_alignment=0.5), alignments=(0.4, 0.9))
+def test_a_grasp_below_a_threshold_comes_last_but_is_kept(kinematics, observation):
+    low, high = score(kinematics, observation, Ranking(min_alignment=0.5), alignments=(0.4, 0.9))
     assert high > low > 2.0
 
 
-def test_a_decider_reads_the_file_that_its_configuration_names(tmp_path):
-    def decider(config: RuntimeConfig) -> GraspSelector:
+def test_a_selector_reads_the_file_that_its_configuration_names(tmp_path):
+    def selector(config: RuntimeConfig) -> GraspSelector:
         return make_grasp_selector(replace(config, n_candidates=200))
 
     q = np.append(z1.Q_HOME, -1.0)
-    plain = decider(RuntimeConfig(detector="tabletop"))
+    plain = selector(RuntimeConfig(detector="tabletop"))
     frame = draw_can(plain.kinematics.flange(z1.Q_HOME) @ z1.T_FLANGE_CAMERA)
-    by_hand = plain.decide(frame, q).ranked
+    configured = plain.select(frame, q).ranked
 
     path = tmp_path / "scoring.yaml"
     save_scoring(Scoring(mvb=Ranking(), full=plain.ranking), path)
-    same = decider(RuntimeConfig(detector="tabletop", scoring=str(path))).decide(frame, q).ranked
-    assert same.indices.tolist() == by_hand.indices.tolist()
+    same = selector(RuntimeConfig(detector="tabletop", scoring=str(path))).select(frame, q).ranked
+    assert same.indices.tolist() == configured.indices.tolist()
 
     save_scoring(Scoring(mvb=Ranking(), full=replace(plain.ranking, k_faces=1, head=HIGHER_IS_BETTER)), path)
-    fitted = decider(RuntimeConfig(detector="tabletop", scoring=str(path))).decide(frame, q).ranked
-    assert 0 < len(fitted) < len(by_hand)
-    assert fitted.indices[0] != by_hand.indices[0]
+    fitted = selector(RuntimeConfig(detector="tabletop", scoring=str(path))).select(frame, q).ranked
+    assert 0 < len(fitted) < len(configured)
+    assert fitted.indices[0] != configured.indices[0]
 
     path.write_text("format: other")
-    with pytest.raises(ScoringError, match="no scoring file"):
-        decider(RuntimeConfig(detector="tabletop", scoring=str(path)))
+    with raises(ScoringError, "scoring_format"):
+        selector(RuntimeConfig(detector="tabletop", scoring=str(path)))

@@ -1,4 +1,4 @@
-"""Motions start and end where they should, at rest, and keep every limit on the way."""
+"""Motions start and end in place, at rest, and keep every limit."""
 
 from __future__ import annotations
 
@@ -13,8 +13,11 @@ from hypothesis.extra import numpy as hnp
 from scipy.spatial.transform import Rotation
 
 from hal.base import transforms, z1
+from hal.base.errors import InvalidValueError
+from tests.support.errors import raises
 from z1_runtime.geometry.kinematics import Kinematics
 from z1_runtime.motion import trajectory
+from z1_runtime.motion.limits import LIMIT_TOLERANCE_RAD
 from z1_runtime.motion.trajectory import MotionLimits, PathFailure
 from z1_runtime.types import JointTrajectory
 
@@ -58,9 +61,9 @@ def test_a_joint_move_goes_straight_and_keeps_all_limits(start: np.ndarray, goal
     assert_sound(motion, limits)
     np.testing.assert_array_equal(motion.q[0], q_start)
     np.testing.assert_array_equal(motion.q[-1], q_goal)
-    way = q_goal - q_start
-    along = (motion.q - q_start) @ way / max(way @ way, 1e-12)
-    np.testing.assert_allclose(motion.q, q_start + along[:, None] * way, atol=1e-6)
+    offset = q_goal - q_start
+    along = (motion.q - q_start) @ offset / max(offset @ offset, 1e-12)
+    np.testing.assert_allclose(motion.q, q_start + along[:, None] * offset, atol=1e-6)
 
 
 def test_a_joint_move_is_as_fast_as_its_slowest_limit() -> None:
@@ -98,7 +101,7 @@ def test_a_straight_move_goes_straight_and_keeps_all_limits(
     assert motion.q[-1, -1] == pytest.approx(jaw_goal, abs=1e-9)
     Ts = np.stack([KINEMATICS.pivot(q[:6]) for q in motion.q[:: max(1, len(motion.q) // 40)]] + [T_goal])
     assert max(transforms.pose_error(KINEMATICS.pivot(motion.q[-1, :6]), T_goal)) < 1e-6
-    # How far each is along the line follows from the one that moves most
+    # The larger of the two errors gives the progress of each along the line
     length_m, angle_rad = transforms.pose_error(T_start, T_goal)
     if max(length_m, angle_rad) > 1e-3:
         progress = [max(transforms.pose_error(T_start, T)) / max(length_m, angle_rad) for T in Ts]
@@ -122,17 +125,18 @@ def test_a_straight_move_out_of_reach_says_where_and_why() -> None:
     T_start = KINEMATICS.pivot(Q_READY[:6])
     T_goal = T_start.copy()
     T_goal[:3, 3] += 0.8, 0.0, 0.0
-    with pytest.raises(PathFailure, match=r"straight line of 800 mm and 0° breaks at \d+ %: no joints") as failure:
+    with raises(PathFailure, "path") as failure:
         trajectory.straight_move(KINEMATICS, T_start, T_goal, Q_READY)
-    broken = transforms.interpolate(T_start, T_goal, np.array([failure.value.fraction, failure.value.fraction - 0.01]))
+    fraction = failure.value.fraction  # pyright: ignore[reportAttributeAccessIssue]
+    broken = transforms.interpolate(T_start, T_goal, np.array([fraction, fraction - 0.01]))
     assert KINEMATICS.solve(broken[0]) == []
     assert KINEMATICS.solve(broken[1]) != []
 
 
-def test_a_straight_move_from_somewhere_else_is_refused() -> None:
+def test_a_straight_move_from_somewhere_else_is_rejected() -> None:
     T_start = KINEMATICS.pivot(Q_READY[:6])
     T_start[0, 3] += 0.01
-    with pytest.raises(ValueError, match=r"10\.0 mm and 0\.0° away from T_start"):
+    with raises(InvalidValueError, "start_pose"):
         trajectory.straight_move(KINEMATICS, T_start, T_start, Q_READY)
 
 
@@ -178,43 +182,65 @@ def test_moving_to_where_the_arm_is_takes_one_period() -> None:
 
 @settings(max_examples=30)
 @given(FRACTIONS, FRACTIONS, st.sampled_from([0.02, 0.1, 0.2]))
-def test_the_pieces_of_a_motion_cover_every_sample_once(start: np.ndarray, goal: np.ndarray, length_s: float) -> None:
+def test_the_parts_of_a_motion_cover_every_sample_once(start: np.ndarray, goal: np.ndarray, length_s: float) -> None:
     motion = trajectory.joint_move(joints(start), joints(goal))
-    covered = [i for piece in motion.pieces(length_s) for i in range(piece.start, piece.stop)]
+    covered = [i for part in motion.split(length_s) for i in range(part.start, part.stop)]
     assert covered == list(range(len(motion.t_s)))
 
 
 @pytest.mark.parametrize("value", [3.1, -0.1, np.nan, np.inf])
 @pytest.mark.parametrize("end", ["q_start", "q_goal"])
-def test_joints_outside_the_limits_are_refused_by_name(end: str, value: float) -> None:
+def test_joints_outside_the_limits_are_rejected_by_name(end: str, value: float) -> None:
     wrong = Q_READY.copy()
     wrong[1] = value
     q_start, q_goal = (wrong, Q_READY) if end == "q_start" else (Q_READY, wrong)
-    with pytest.raises(ValueError, match=rf"{end}: joint2 is {value:.4f} rad; allowed is 0\.0000 to 2\.9671 rad"):
+    with raises(InvalidValueError, "joint_limit") as caught:
         trajectory.joint_move(q_start, q_goal)
+    assert f"{end}: joint2 is {value:.4f} rad; allowed is 0.0000 to 2.9671 rad" in str(caught.value)
 
 
-def test_a_jaw_goal_outside_the_limits_is_refused_by_name() -> None:
+BEYOND_RAD = st.floats(0.0, LIMIT_TOLERANCE_RAD)
+
+
+@given(hnp.arrays(np.bool_, z1.N_JOINTS), BEYOND_RAD, BEYOND_RAD)
+def test_joints_a_hair_beyond_the_limits_are_clipped(upper: np.ndarray, start_rad: float, goal_rad: float) -> None:
+    at_limit, sign = np.where(upper, z1.Q_MAX, z1.Q_MIN), np.where(upper, 1.0, -1.0)
+    motion = trajectory.joint_move(at_limit + start_rad * sign, at_limit + goal_rad * sign)
+    np.testing.assert_array_equal(motion.q[[0, -1]], [at_limit, at_limit])
+    held = trajectory.hold(at_limit + start_rad * sign, 0.01)
+    np.testing.assert_array_equal(held.q[0], at_limit)
+
+
+@given(st.floats(z1.GRIPPER_OPEN - 0.005, 0.005), st.floats(-12.0, -3.0), st.booleans())
+def test_jaw_moves_of_every_length_and_at_every_edge_never_raise(start: float, exponent: float, opening: bool) -> None:
+    q = np.append(Q_READY[:6], start)
+    goal = np.clip(start + (-1.0 if opening else 1.0) * 10.0**exponent, z1.GRIPPER_OPEN - 0.005, 0.005)
+    motion = trajectory.gripper_move(q, float(goal))
+    assert ((motion.q[:, -1] >= z1.GRIPPER_OPEN) & (motion.q[:, -1] <= z1.GRIPPER_CLOSED)).all()
+    assert motion.q[-1, -1] == np.clip(goal, z1.GRIPPER_OPEN, z1.GRIPPER_CLOSED)
+
+
+def test_a_jaw_goal_outside_the_limits_is_rejected() -> None:
     T = KINEMATICS.pivot(Q_READY[:6])
-    with pytest.raises(ValueError, match=r"gripper is 0\.3000 rad"):
+    with raises(InvalidValueError, "joint_limit"):
         trajectory.straight_move(KINEMATICS, T, T, Q_READY, 0.3)
-    with pytest.raises(ValueError, match=r"gripper is 0\.3000 rad"):
+    with raises(InvalidValueError, "joint_limit"):
         trajectory.gripper_move(Q_READY, 0.3)
 
 
-def test_limits_above_the_arm_are_refused() -> None:
-    with pytest.raises(ValueError, match="velocity"):
+def test_limits_above_the_arm_are_rejected() -> None:
+    with raises(InvalidValueError, "invalid_value"):
         MotionLimits(velocity=1.1 * z1.DQ_MAX)
-    with pytest.raises(ValueError, match="linear_jerk"):
+    with raises(InvalidValueError, "invalid_value"):
         MotionLimits(linear_jerk=0.0)
-    with pytest.raises(ValueError, match=r"speed is 1\.5"):
+    with raises(InvalidValueError, "invalid_value"):
         MotionLimits.at_speed(1.5)
 
 
 def test_motions_that_do_not_join_are_not_concatenated() -> None:
     elsewhere = Q_READY.copy()
     elsewhere[3] += 0.1
-    with pytest.raises(ValueError, match=r"joint4 would jump by 0\.1"):
+    with raises(InvalidValueError, "jump"):
         trajectory.concatenate([trajectory.hold(Q_READY, 0.1), trajectory.hold(elsewhere, 0.1)])
 
 

@@ -20,7 +20,15 @@ from models.obb.obb import OrientedBox
 from models.types import Detection, GraspSet
 from tests.support.errors import raises
 from z1_runtime.geometry.kinematics import Kinematics
-from z1_runtime.types import GraspPlan, JointTrajectory, Observation, Plane, Rejection
+from z1_runtime.types import (
+    GraspPlan,
+    JointTrajectory,
+    Observation,
+    Plane,
+    PlanningStage,
+    Rejection,
+    RejectionReason,
+)
 from z1_runtime.visualization import blueprint
 from z1_runtime.visualization.archetypes import gripper_strips
 from z1_runtime.visualization.recorder import Recorder, ViewerPortError
@@ -85,7 +93,7 @@ def make_plan() -> GraspPlan:
         jaw_open=-1.0,
         jaw_contact=-0.3,
         **{field.name: leg for field in fields(GraspPlan) if field.type == "JointTrajectory"},
-        rejections=(Rejection(rank=0, reason="ik", detail="out of reach"),),
+        rejections=(Rejection(rank=0, reason=RejectionReason.IK, stage=PlanningStage.IK, detail="out of reach"),),
     )
 
 

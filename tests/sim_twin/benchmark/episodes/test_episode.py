@@ -62,7 +62,7 @@ def test_a_row_holds_what_a_scoring_head_is_fitted_to(rows, decider):
 
 def test_an_object_that_is_not_where_it_was_seen_is_not_called_lifted(decider):
     frame, q = look(SCENARIO.scene())
-    plan = decider.decide(frame, q).plan
+    plan = decider.select(frame, q).plan
     elsewhere = SceneConfig(object="cylinder", distance_m=0.60, lateral_m=0.20)
     with Robot(elsewhere, decider.kinematics) as robot:
         outcome = robot.act(plan)

@@ -101,7 +101,7 @@ def test_what_would_stop_a_real_arm_is_not_tried_again(decider, monkeypatch, mod
 
 def test_what_slipped_but_hangs_is_put_down_before_the_jaws_open(decider):
     frame, q = look(SCENARIO.scene())
-    plan = decider.decide(frame, q).plan
+    plan = decider.select(frame, q).plan
     with Robot(SCENARIO.scene(), decider.kinematics) as robot:
         outcome = robot.act(plan)
         assert outcome.mode is Mode.SUCCESS

@@ -11,8 +11,10 @@ from sim_twin.benchmark.episodes.seen import SharedObservation
 from sim_twin.benchmark.results.store import Store
 from z1_runtime.config import RuntimeConfig
 from z1_runtime.factory import make_grasp_selector
+from z1_runtime.grasping.features import measure_features
 from z1_runtime.grasping.ranking import Ranking, Scoring, ScoringError, ScoringHead, save_scoring
-from z1_runtime.tasks.grasp_selection import StageTimes, draw_can
+from z1_runtime.tasks.grasp_selection import StageTimes
+from z1_runtime.tasks.warm_up import draw_can
 
 HEAD = ScoringHead(features=("above_m",), mean=(0.0,), scale=(0.01,), coefficients=(1.0,), intercept=0.0)
 Q = np.append(z1.Q_HOME, -1.0)
@@ -40,8 +42,8 @@ def seen(decider):
 
 
 def order(text, seen, decider):
-    ranked, left = parse_method(text).order(seen, decider, StageTimes())
-    return ranked, left[ranked.indices].tolist()
+    best_first, left = parse_method(text).order(seen, decider, StageTimes())
+    return best_first.ranked, left[best_first.ranked.indices].tolist()
 
 
 def test_a_scoring_file_gives_each_method_its_own_numbers(file):
@@ -71,8 +73,8 @@ def test_full_heeds_its_settings_and_is_else_as_configured(seen, decider):
 
 
 def test_a_head_orders_the_grasps_of_mvb_by_what_it_was_told_to_like(seen, decider, file):
-    ranked, _ = order(f"mvb:scoring={file},k=2,hard_filter=yes", seen, decider)
-    heights = decider.planner.features(ranked.grasps, seen.observation)[:, 3]
+    best_first, _ = parse_method(f"mvb:scoring={file},k=2,hard_filter=yes").order(seen, decider, StageTimes())
+    heights = measure_features(best_first.candidates)[:, 3]
     assert (np.diff(heights) <= 1e-9).all()
     assert sorted(order(f"mvb:scoring={file},k=2,hard_filter=yes", seen, decider)[1]) == sorted(
         order("mvb", seen, decider)[1]
