@@ -66,12 +66,12 @@ def main(config: Config) -> int:
     """Fit, judge, write, and say what was kept."""
     from sim_twin.benchmark.tuning.fit import tune
     from sim_twin.benchmark.tuning.folds import require_sklearn
+    from sim_twin.benchmark.tuning.logged_episodes import load_logs
     from sim_twin.benchmark.tuning.report import write_tuning_report
-    from sim_twin.benchmark.tuning.rows import read_logs
     from z1_runtime.grasping.ranking import save_scoring
 
     require_sklearn()
-    logs = read_logs(config.logs)
+    logs = load_logs(config.logs)
     console = Console(highlight=False)
     tuning = tune(
         logs,
@@ -115,14 +115,14 @@ def _runner(config: Config, runtime: RuntimeConfig, console: Console):
 
 def _print(console: Console, tuning: Tuning) -> None:
     from sim_twin.benchmark.tuning.report import (
-        HELD_OUT_HEAD,
-        SKILL_HEAD,
-        THRESHOLD_HEAD,
-        held_out_lines,
-        skill_line,
-        threshold_line,
+        HELD_OUT_HEADER,
+        SKILL_HEADER,
+        THRESHOLD_HEADER,
+        held_out_rows,
+        skill_row,
+        threshold_row,
     )
-    from sim_twin.benchmark.tuning.variants import said
+    from sim_twin.benchmark.tuning.variants import format_ranking
 
     for name, family in tuning.families.items():
         variants = family.draft.variants
@@ -131,18 +131,20 @@ def _print(console: Console, tuning: Tuning) -> None:
         )
         for text in variants.names:
             own = [f"{count[text]} of {variants.scenarios}" for count in variants.successes.values()]
-            table.add_row(text, said(family.draft.rankings[text]), *own)
+            table.add_row(text, format_ranking(family.draft.rankings[text]), *own)
         console.print(table)
         console.print(
             f"chosen without the scenarios it is judged on: {variants.cross_validated} of {variants.scenarios} "
             f"({tuning.reading})"
         )
-        _print_table(console, THRESHOLD_HEAD, [threshold_line(*item) for item in family.draft.thresholds.items()])
-        _print_table(console, HELD_OUT_HEAD, held_out_lines(family), f"judged on seeds {_words(tuning.held_out_seeds)}")
+        _print_table(console, THRESHOLD_HEADER, [threshold_row(*item) for item in family.draft.thresholds.items()])
+        _print_table(
+            console, HELD_OUT_HEADER, held_out_rows(family), f"judged on seeds {_words(tuning.held_out_seeds)}"
+        )
     if tuning.head is not None:
-        lines = [skill_line("other scenarios", tuning.head.skill)]
-        lines += [skill_line(f"{name}, fitted to the others", skill) for name, skill in tuning.head.objects.items()]
-        _print_table(console, SKILL_HEAD, lines, "scoring head")
+        lines = [skill_row("other scenarios", tuning.head.skill)]
+        lines += [skill_row(f"{name}, fitted to the others", skill) for name, skill in tuning.head.objects.items()]
+        _print_table(console, SKILL_HEADER, lines, "scoring head")
     console.print(tuning.head_note)
     for name, family in tuning.families.items():
         console.print(f"[bold]{name}[/bold]: {family.why}")

@@ -19,8 +19,8 @@ from rich.table import Table
 from hal.base import z1
 from hal.base.clock import Stopwatch
 from hal.base.transforms import inverse
+from sim_twin.benchmark.episodes.execution import capture
 from sim_twin.benchmark.episodes.scenarios import PAPER_OBJECTS, grid
-from sim_twin.benchmark.episodes.trial import look
 from z1_runtime.perception.extrinsics_check import ExtrinsicsCheck
 
 
@@ -44,7 +44,7 @@ def main(config: Config) -> None:
     for number in track(range(config.looks), description="looks"):
         off = {"mount_error_m": config.error_m, "mount_error_deg": config.error_deg, "mount_seed": number}
         scene = replace(poses[number * len(poses) // config.looks].scene(), seed=number, **off)
-        frame, q = look(scene)
+        frame, q = capture(scene)
         watch = Stopwatch()
         seen = sight.correct(frame, float(q[-1]), z1.T_FLANGE_CAMERA)
         times.append(watch.lap_ms())

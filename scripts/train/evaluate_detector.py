@@ -25,7 +25,7 @@ from rich.table import Table
 from hal.base import z1
 from hal.base.clock import Stopwatch
 from hal.base.errors import MissingFileError
-from models.detector.detector import YoloConfig, YoloModel, best_of, labels_for
+from models.detector.detector import YoloConfig, YoloModel, labels_for, select_best
 from models.detector.weights import detector_path
 from models.types import Detection
 from scripts.train.detection_measures import Tally, mask_iou, match
@@ -33,7 +33,7 @@ from scripts.train.make_detection_dataset import read_labels
 from sim_twin.benchmark.episodes.scenarios import PAPER_OBJECTS, Scenario, grid
 from sim_twin.camera.d405 import INTRINSICS, measure_colour
 from sim_twin.detection_data.props import CLASSES
-from sim_twin.detection_data.scenes import Appearance, Label, Picture, draw_scenario
+from sim_twin.detection_data.scenes import Appearance, Label, LabelledImage, draw_scenario
 
 WANTED = {
     "box_map50": 0.97,
@@ -139,7 +139,7 @@ def measure_empty(detector: YoloModel, data: Path) -> dict[str, object]:
     }
 
 
-def twin_views() -> Iterator[tuple[Scenario, Picture]]:
+def twin_views() -> Iterator[tuple[Scenario, LabelledImage]]:
     """Yield the 81 scenarios as the twin's wrist camera sees them from home, noise included."""
     import mujoco
 
@@ -162,22 +162,24 @@ def twin_views() -> Iterator[tuple[Scenario, Picture]]:
             mujoco.mj_camlight(world.model, data)
             view = renderer.render(data)
             colour = measure_colour(view.colour, scenario.draw_seed, 0)
-            yield scenario, Picture(colour=colour, labels=(Label(name=name, mask=view.mask),), look="twin")
+            yield scenario, LabelledImage(colour=colour, labels=(Label(name=name, mask=view.mask),), look="twin")
         renderer.close()
 
 
-def spoilt_views(look: Appearance) -> Iterator[tuple[Scenario, Picture]]:
+def spoilt_views(look: Appearance) -> Iterator[tuple[Scenario, LabelledImage]]:
     """Yield the same poses, each in a room and through a camera of its own."""
-    from sim_twin.detection_data.scene_renderer import Stage
+    from sim_twin.detection_data.scene_renderer import SceneRenderer
 
-    stage = Stage(_STAGE_SEED)
+    renderer = SceneRenderer(_STAGE_SEED)
     for scenario in grid():
         rng = np.random.default_rng([_STAGE_SEED, scenario.draw_seed])
         yield (
             scenario,
-            draw_scenario(stage, scenario.object, scenario.scene().T_base_object(), rng, look=look, jaw_rad=_JAW_RAD),
+            draw_scenario(
+                renderer, scenario.object, scenario.scene().T_base_object(), rng, look=look, jaw_rad=_JAW_RAD
+            ),
         )
-    stage.close()
+    renderer.close()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -189,13 +191,13 @@ class Seen:
     """Some of the views, drawn on."""
 
 
-def measure_views(detector: YoloModel, views: Iterator[tuple[Scenario, Picture]], look: str) -> Seen:
+def measure_views(detector: YoloModel, views: Iterator[tuple[Scenario, LabelledImage]], look: str) -> Seen:
     """Return in how many of the 81 views the right object is found with an IoU of at least 0.8, and which fail."""
     ious: dict[str, float] = {}
     tiles = []
     for number, (scenario, picture) in enumerate(track(views, description=f"views, {look}", total=81)):
         found = detector.detect(picture.colour)
-        best = best_of(found, labels_for(scenario.object, detector.classes))
+        best = select_best(found, labels_for(scenario.object, detector.classes))
         seen = best.mask if best is not None else None
         truth = picture.labels[0].mask if picture.labels else np.zeros(picture.colour.shape[:2], dtype=bool)
         ious[scenario.key] = 0.0 if seen is None else mask_iou(seen, truth)

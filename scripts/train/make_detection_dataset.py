@@ -22,7 +22,7 @@ import tyro
 from rich.progress import track
 
 from sim_twin.detection_data.props import CLASSES
-from sim_twin.detection_data.scenes import Label, Picture, SceneMix
+from sim_twin.detection_data.scenes import Label, LabelledImage, SceneMix
 
 SPLITS = {"train": 1_000_000, "val": 2_000_000, "empty": 3_000_000}
 """Name to the first seed: no two splits share a seed, so neither props, textures nor lights."""
@@ -99,19 +99,19 @@ def plan_shards(config: Config) -> list[Shard]:
 
 def make_shard(shard: Shard) -> None:
     """Draw a shard's pictures and move them to their place when all are there."""
-    from sim_twin.detection_data.scene_renderer import Stage
+    from sim_twin.detection_data.scene_renderer import SceneRenderer
     from sim_twin.detection_data.scenes import draw_scene
 
     images = shard.out / "partial" / f"{shard.seed}.{os.getpid()}"
     labels = shard.out / "labels" / shard.split / str(shard.seed)
     images.mkdir(parents=True)
     labels.mkdir(parents=True, exist_ok=True)
-    stage = Stage(shard.seed)
+    renderer = SceneRenderer(shard.seed)
     for number in range(shard.count):
-        picture = draw_scene(stage, np.random.default_rng([shard.seed, 2, number]), shard.mix)
+        picture = draw_scene(renderer, np.random.default_rng([shard.seed, 2, number]), shard.mix)
         name = f"{number:04d}_{picture.look}"
         _write_picture(picture, images / f"{name}.jpg", labels / f"{name}.txt")
-    stage.close()
+    renderer.close()
     if shard.folder.is_dir():  # another process was faster
         shutil.rmtree(images)
     else:
@@ -138,7 +138,7 @@ def to_line(label: Label) -> str:
 
     height, width = label.mask.shape
     outlines, _ = cv2.findContours(label.mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
-    parts = [outline.reshape(-1, 2) for outline in outlines if len(outline) > 2]
+    parts = [project_outline.reshape(-1, 2) for project_outline in outlines if len(project_outline) > 2]
     parts = parts or [np.repeat(outlines[0].reshape(-1, 2), 3, axis=0)[:3]]
     corners = parts[0] if len(parts) == 1 else np.concatenate(merge_multi_segment([p.ravel().tolist() for p in parts]))
     shares = (corners + 0.5) / [width, height]
@@ -157,7 +157,7 @@ def read_labels(path: Path, shape: tuple[int, int]) -> tuple[Label, ...]:
     return tuple(labels)
 
 
-def _write_picture(picture: Picture, image: Path, labels: Path) -> None:
+def _write_picture(picture: LabelledImage, image: Path, labels: Path) -> None:
     quality = [cv2.IMWRITE_JPEG_QUALITY, 92]
     cv2.imwrite(str(image), cv2.cvtColor(picture.colour, cv2.COLOR_RGB2BGR), quality)
     labels.write_text("".join(to_line(label) + "\n" for label in picture.labels))

@@ -30,11 +30,11 @@ def draw_picture(config: SceneConfig, qpos: np.ndarray, width: int = 1280, heigh
     data.qpos[:] = qpos
     mujoco.mj_forward(model, data)
     file = io.BytesIO()
-    Image.fromarray(draw_outside(model, data, width, height)).save(file, format="PNG", optimize=True)
+    Image.fromarray(render_external(model, data, width, height)).save(file, format="PNG", optimize=True)
     return file.getvalue()
 
 
-def draw_outside(
+def render_external(
     model: mujoco.MjModel, data: mujoco.MjData, width: int, height: int, kind: str | None = None
 ) -> np.ndarray:
     """Return a picture (height, width, 3) uint8, from beside the table, of the state `data` (kinematics computed).

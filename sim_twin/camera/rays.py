@@ -9,7 +9,7 @@ import numpy as np
 
 from hal.base.messages import Intrinsics
 from sim_twin.camera.wrist_view import View, camera_id, object_geoms
-from sim_twin.model.charuco_board import PRINT, BoardSpec, project_print
+from sim_twin.model.charuco_board import PRINT_GEOM, BoardSpec, project_print
 from sim_twin.model.z1_mjcf import GROUP_ARM, GROUP_SCENE
 
 _SKY = np.array([205, 214, 224], np.uint8)
@@ -67,7 +67,7 @@ class RayRenderer:
 
     def __init__(self, model: mujoco.MjModel, intrinsics: Intrinsics, board: BoardSpec | None = None) -> None:
         self._intrinsics, self._board = intrinsics, board
-        self._print = model.geom(PRINT).id if board is not None else None
+        self._print = model.geom(PRINT_GEOM).id if board is not None else None
         self._caster = RayCaster(model, intrinsics, (GROUP_SCENE, GROUP_ARM))
         self._camera = camera_id(model)
         self._is_object = np.append(object_geoms(model), False)  # geom −1: nothing hit

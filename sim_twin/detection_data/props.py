@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from sim_twin.model.objects import OBJECTS
-from sim_twin.model.parts import Part, lathe
+from sim_twin.model.parts import Part, make_lathe
 from sim_twin.model.z1_mjcf import GROUP_SCENE
 
 CLASSES = ("bottle", "box", "cylinder")
@@ -125,7 +125,7 @@ def _make_bottle(rng: np.random.Generator) -> tuple[Part, ...]:
     cap = neck * rng.uniform(1.0, 1.25)
     radii = [0.92 * radius, radius, radius, radius, radius, neck, neck, cap]
     profile = tuple((height * h, float(r)) for h, r in zip(heights, radii, strict=True))
-    return lathe(profile, ((0.05, _RGBA),) * 7)
+    return make_lathe(profile, ((0.05, _RGBA),) * 7)
 
 
 def _make_ball(rng: np.random.Generator) -> Prop:

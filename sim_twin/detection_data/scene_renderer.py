@@ -38,7 +38,7 @@ _GEOMS_DRAWN = 800
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Actor:
+class PropInstance:
     """A prop on the stage, with the numbers of its body and geoms in the model."""
 
     prop: Prop
@@ -46,7 +46,7 @@ class Actor:
     geoms: np.ndarray
 
 
-class Stage:
+class SceneRenderer:
     """Draws pictures with exact instance masks; belongs to the thread that made it.
 
     Args:
@@ -59,7 +59,7 @@ class Stage:
 
     def __init__(self, seed: int, intrinsics: Intrinsics = INTRINSICS) -> None:
         rng = np.random.default_rng([seed, 1])
-        self.model, self.actors = _build(rng)
+        self.model, self.props = _build(rng)
         self.data = mujoco.MjData(self.model)
         self.arm_geoms = np.flatnonzero(np.isin(self.model.geom_group, (GROUP_ARM, GROUP_VISUAL)))
         self.arm_rgba = self.model.geom_rgba[self.arm_geoms].copy()
@@ -73,39 +73,39 @@ class Stage:
         self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED.value
         self._pixels = np.empty((intrinsics.height, intrinsics.width, 3), np.uint8)
 
-    def named(self, kind: str) -> list[Actor]:
+    def named(self, kind: str) -> list[PropInstance]:
         """Return the actors of a class, the nominal one first."""
-        return [actor for actor in self.actors if actor.prop.kind == kind]
+        return [instance for instance in self.props if instance.prop.kind == kind]
 
-    def distractors(self) -> list[Actor]:
+    def distractors(self) -> list[PropInstance]:
         """Return the actors of no class."""
-        return [actor for actor in self.actors if actor.prop.kind not in CLASSES]
+        return [instance for instance in self.props if instance.prop.kind not in CLASSES]
 
     def clear(self) -> None:
         """Take every actor off the stage."""
-        for actor in self.actors:
-            self.hide(actor)
+        for instance in self.props:
+            self.hide(instance)
 
-    def hide(self, actor: Actor) -> None:
-        """Take `actor` off the stage."""
-        self.model.geom_group[actor.geoms] = HIDDEN_GROUP
+    def hide(self, instance: PropInstance) -> None:
+        """Take `instance` off the renderer."""
+        self.model.geom_group[instance.geoms] = HIDDEN_GROUP
 
-    def shows(self, actor: Actor) -> bool:
-        """Return whether `actor` is on the stage."""
-        return bool(self.model.geom_group[actor.geoms[0]] == GROUP_SCENE)
+    def is_shown(self, instance: PropInstance) -> bool:
+        """Return whether `instance` is on the renderer."""
+        return bool(self.model.geom_group[instance.geoms[0]] == GROUP_SCENE)
 
-    def put(self, actor: Actor, T_base_prop: np.ndarray) -> None:
-        """Show `actor` at `T_base_prop` (4, 4)."""
-        self.model.geom_group[actor.geoms] = GROUP_SCENE
+    def put(self, instance: PropInstance, T_base_prop: np.ndarray) -> None:
+        """Show `instance` at `T_base_prop` (4, 4)."""
+        self.model.geom_group[instance.geoms] = GROUP_SCENE
         quat = np.empty(4)
         mujoco.mju_mat2Quat(quat, T_base_prop[:3, :3].ravel().copy())
-        self.data.mocap_pos[actor.mocap], self.data.mocap_quat[actor.mocap] = T_base_prop[:3, 3], quat
+        self.data.mocap_pos[instance.mocap], self.data.mocap_quat[instance.mocap] = T_base_prop[:3, 3], quat
 
-    def pose(self, actor: Actor) -> np.ndarray:
-        """Return where `actor` was put, T_base_prop (4, 4)."""
+    def pose(self, instance: PropInstance) -> np.ndarray:
+        """Return where `instance` was put, T_base_prop (4, 4)."""
         pose, rotation = np.eye(4), np.empty(9)
-        mujoco.mju_quat2Mat(rotation, self.data.mocap_quat[actor.mocap])
-        pose[:3, :3], pose[:3, 3] = rotation.reshape(3, 3), self.data.mocap_pos[actor.mocap]
+        mujoco.mju_quat2Mat(rotation, self.data.mocap_quat[instance.mocap])
+        pose[:3, :3], pose[:3, 3] = rotation.reshape(3, 3), self.data.mocap_pos[instance.mocap]
         return pose
 
     def set_arm(self, q: np.ndarray) -> np.ndarray:
@@ -146,20 +146,20 @@ class Stage:
             arm: `pieces`, as the twin's wrist camera sees it, `whole` with its camera, or `none`.
             shadows: whether lights throw them.
         """
-        self._look(camera, arm, shadows)
+        self._update_scene(camera, arm, shadows)
         self._canvas.draw(self._scene, self._pixels)
         return np.ascontiguousarray(self._pixels[::-1])
 
     def draw_instances(self, camera: str, arm: str) -> np.ndarray:
-        """Return which actor (index in `actors`) each pixel (H, W) int16 shows; −1 = none."""
-        self._look(camera, arm, False)
+        """Return which actor (index in `props`) each pixel (H, W) int16 is_shown; −1 = none."""
+        self._update_scene(camera, arm, False)
         by_number = [int(mujoco.mjtRndFlag.mjRND_SEGMENT), int(mujoco.mjtRndFlag.mjRND_IDCOLOR)]
         self._scene.flags[by_number] = True
         self._canvas.draw(self._scene, self._pixels)
         self._scene.flags[by_number] = False
         owner = np.full(self.model.ngeom, -1, np.int16)
-        for number, actor in enumerate(self.actors):
-            owner[actor.geoms] = number
+        for number, instance in enumerate(self.props):
+            owner[instance.geoms] = number
         table = np.full(65536, -1, np.int16)
         for geom in self._scene.geoms[: self._scene.ngeom]:
             if geom.segid >= 0 and geom.objtype == mujoco.mjtObj.mjOBJ_GEOM:
@@ -171,7 +171,7 @@ class Stage:
         """Free the OpenGL context."""
         self._canvas.close()
 
-    def _look(self, camera: str, arm: str, shadows: bool) -> None:
+    def _update_scene(self, camera: str, arm: str, shadows: bool) -> None:
         self._option.geomgroup[:] = 0
         shown = {"pieces": [GROUP_ARM], "whole": [GROUP_VISUAL, GROUP_MOUNT], "none": []}[arm]
         self._option.geomgroup[[GROUP_SCENE, *shown]] = 1
@@ -184,7 +184,7 @@ class Stage:
         set_pinhole(self._scene, self.intrinsics)
 
 
-def _build(rng: np.random.Generator) -> tuple[mujoco.MjModel, list[Actor]]:
+def _build(rng: np.random.Generator) -> tuple[mujoco.MjModel, list[PropInstance]]:
     spec = mujoco.MjSpec()
     spec.compiler.degree = False
     spec.stat.extent, spec.stat.center = 1.0, [0.3, 0.0, 0.2]
@@ -199,7 +199,7 @@ def _build(rng: np.random.Generator) -> tuple[mujoco.MjModel, list[Actor]]:
     geoms = [add_prop(spec, prop, f"prop_{number}") for number, prop in enumerate(props)]
     model = spec.compile()
     return model, [
-        Actor(
+        PropInstance(
             prop=prop,
             mocap=int(model.body(f"prop_{number}").mocapid[0]),
             geoms=np.array([model.geom(name).id for name in geoms[number]]),

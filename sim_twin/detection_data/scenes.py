@@ -10,8 +10,8 @@ import numpy as np
 
 from hal.base import z1
 from sim_twin.camera.d405 import measure_colour
-from sim_twin.detection_data.appearance import dress_as_twin, dress_at_random
-from sim_twin.detection_data.photometric_noise import spoil_photo
+from sim_twin.detection_data.appearance import apply_twin_appearance, randomize_appearance
+from sim_twin.detection_data.photometric_noise import augment_image
 from sim_twin.detection_data.placement import (
     NEAREST_M,
     choose_objects,
@@ -20,21 +20,21 @@ from sim_twin.detection_data.placement import (
     place_objects,
     place_occluder,
 )
-from sim_twin.detection_data.scene_renderer import Actor, Stage
+from sim_twin.detection_data.scene_renderer import PropInstance, SceneRenderer
 
 if TYPE_CHECKING:
     from hal.base.messages import Intrinsics
 
 Appearance = Literal["twin", "own", "any"]
 """How things look: all as in the twin; our objects in their own colours, the rest at random; all at random."""
-LEAST_PIXELS = 600
+MIN_PIXELS = 600
 """An object that shows fewer pixels at 640×480 is taken out of the scene."""
-LEAST_SHARE = 0.5
-"""So is one that shows less of its outline, unless it fills `_LARGE_SHARE` of the picture."""
-LEAST_MARK_SHARE = 0.5
+MIN_VISIBLE_RATIO = 0.5
+"""So is one that shows less of its outline, unless it fills `_LARGE_RATIO` of the picture."""
+MIN_MARK_RATIO = 0.5
 """So is a mug that shows less of its handle, and a bottle in random colours that shows less of its neck: nothing else
 tells either from a cylinder."""
-_LARGE_SHARE = 0.15
+_LARGE_RATIO = 0.15
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -53,7 +53,7 @@ class Label:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Picture:
+class LabelledImage:
     """One picture and what it shows."""
 
     colour: np.ndarray
@@ -86,71 +86,73 @@ class SceneMix:
     """Things of no class in a picture, in the mean; fewer where they do not fit."""
 
 
-def draw_scene(stage: Stage, rng: np.random.Generator, mix: SceneMix | None = None) -> Picture:
+def draw_scene(renderer: SceneRenderer, rng: np.random.Generator, mix: SceneMix | None = None) -> LabelledImage:
     """Return the picture of a random scene."""
     mix = mix or SceneMix()
-    stage.clear()
+    renderer.clear()
     by_wrist = rng.random() < mix.wrist
-    look = _choose_look(rng, mix)
+    look = _choose_appearance(rng, mix)
     arm = "pieces" if by_wrist else "whole" if rng.random() < 0.25 else "none"
     camera = "wrist" if by_wrist else "free"
-    T_base_camera, centre = place_camera(stage, by_wrist, rng)
+    T_base_camera, centre = place_camera(renderer, by_wrist, rng)
     crowd = mix.crowd > 0.0 and rng.random() < mix.crowd
     objects = (
         []
         if rng.random() < mix.empty
-        else choose_objects(stage, rng, nominal=mix.nominal if look == "any" else 1.0, crowd=crowd)
+        else choose_objects(renderer, rng, nominal=mix.nominal if look == "any" else 1.0, crowd=crowd)
     )
     end_on = look != "any"
     places = place_objects(
-        stage, objects, T_base_camera, centre=centre, by_wrist=by_wrist, crowd=crowd, end_on=end_on, rng=rng
+        renderer, objects, T_base_camera, centre=centre, by_wrist=by_wrist, crowd=crowd, end_on=end_on, rng=rng
     )
     place_distractors(
-        stage, places, T_base_camera, centre=centre, number=mix.distractors, spread=mix.crowd > 0.0, rng=rng
+        renderer, places, T_base_camera, centre=centre, number=mix.distractors, spread=mix.crowd > 0.0, rng=rng
     )
     if places and rng.random() < mix.occluded:
-        place_occluder(stage, places[0], T_base_camera, rng)
-    _dress(stage, look, objects, rng)
-    labels = _see(stage, objects, camera, arm, by_shape=look == "any")
-    colour = stage.draw(camera, arm, shadows=look != "twin" and rng.random() < 0.6)
+        place_occluder(renderer, places[0], T_base_camera, rng)
+    _apply_appearance(renderer, look, objects, rng)
+    labels = _label_visible(renderer, objects, camera, arm, by_shape=look == "any")
+    colour = renderer.draw(camera, arm, shadows=look != "twin" and rng.random() < 0.6)
     if look == "twin" and rng.random() < 0.6:
-        return Picture(colour=measure_colour(colour, int(rng.integers(2**31)), 0), labels=labels, look=look)
-    return Picture(colour=spoil_photo(colour, rng), labels=labels, look=look)
+        return LabelledImage(colour=measure_colour(colour, int(rng.integers(2**31)), 0), labels=labels, look=look)
+    return LabelledImage(colour=augment_image(colour, rng), labels=labels, look=look)
 
 
-def _choose_look(rng: np.random.Generator, mix: SceneMix) -> Appearance:
+def _choose_appearance(rng: np.random.Generator, mix: SceneMix) -> Appearance:
     share = rng.random()
     return "twin" if share < mix.twin else "own" if share < mix.twin + mix.own else "any"
 
 
 def draw_scenario(
-    stage: Stage,
+    renderer: SceneRenderer,
     name: str,
     T_base_object: np.ndarray,
     rng: np.random.Generator,
     *,
     look: Appearance,
     jaw_rad: float = -1.0,
-) -> Picture:
+) -> LabelledImage:
     """Return the picture from home of one benchmark object at `T_base_object` (4, 4), by the light of any room."""
-    stage.clear()
-    stage.set_arm(np.append(z1.Q_HOME, jaw_rad))
-    actor = stage.named(name)[0]
-    stage.put(actor, T_base_object)
-    _dress(stage, look, [actor], rng)
-    labels = _see(stage, [actor], "wrist", "pieces", by_shape=False)
-    colour = stage.draw("wrist", "pieces", shadows=look != "twin" and rng.random() < 0.6)
-    return Picture(colour=spoil_photo(colour, rng), labels=labels, look=look)
+    renderer.clear()
+    renderer.set_arm(np.append(z1.Q_HOME, jaw_rad))
+    instance = renderer.named(name)[0]
+    renderer.put(instance, T_base_object)
+    _apply_appearance(renderer, look, [instance], rng)
+    labels = _label_visible(renderer, [instance], "wrist", "pieces", by_shape=False)
+    colour = renderer.draw("wrist", "pieces", shadows=look != "twin" and rng.random() < 0.6)
+    return LabelledImage(colour=augment_image(colour, rng), labels=labels, look=look)
 
 
-def _dress(stage: Stage, look: Appearance, objects: list[Actor], rng: np.random.Generator) -> None:
+def _apply_appearance(
+    renderer: SceneRenderer, look: Appearance, objects: list[PropInstance], rng: np.random.Generator
+) -> None:
     if look == "twin":
-        dress_as_twin(stage)
+        apply_twin_appearance(renderer)
     else:
-        dress_at_random(stage, rng, but=objects if look == "own" else ())
+        randomize_appearance(renderer, rng, but=objects if look == "own" else ())
 
 
-def outline(corners: list[np.ndarray], T_base_camera: np.ndarray, intrinsics: Intrinsics) -> np.ndarray | None:
+def project_outline(corners: list[np.ndarray], T_base_camera: np.ndarray, intrinsics: Intrinsics) -> np.ndarray | None:
     """Return what parts with those `corners` [(N, 3) in base, each] would cover, nothing hidden, at half size.
 
     The picture is the middle third of what is returned (3 H / 2, 3 W / 2) bool, so that what lies up to one picture
@@ -169,67 +171,77 @@ def outline(corners: list[np.ndarray], T_base_camera: np.ndarray, intrinsics: In
     return canvas.astype(bool)
 
 
-def seen_share(mask: np.ndarray, whole: np.ndarray) -> float:
-    """Return which share of an `outline` the visible pixels `mask` (H, W) bool show."""
+def visible_ratio(mask: np.ndarray, whole: np.ndarray) -> float:
+    """Return which share of an `project_outline` the visible pixels `mask` (H, W) bool show."""
     height, width = mask.shape[0] // 2, mask.shape[1] // 2
     inside = whole[height : 2 * height, width : 2 * width]
     return np.count_nonzero(inside & mask[::2, ::2]) / max(np.count_nonzero(whole), 1)
 
 
-def _see(stage: Stage, objects: list[Actor], camera: str, arm: str, *, by_shape: bool) -> tuple[Label, ...]:
+def _label_visible(
+    renderer: SceneRenderer, objects: list[PropInstance], camera: str, arm: str, *, by_shape: bool
+) -> tuple[Label, ...]:
     """Return the visible objects' labels; what shows too little is taken off the stage, and the rest seen again.
 
     Args:
         stage: with everything in its place.
         objects: those that may have a label.
         camera: `wrist` or `free`.
-        arm: as `Stage.draw` takes it.
+        arm: as `SceneRenderer.draw` takes it.
         by_shape: the objects' colours say nothing, so that shape alone must tell what they are.
     """
     shown = list(objects)
-    mugs = [actor for actor in stage.distractors() if actor.prop.kind == "mug" and stage.shows(actor)]
-    T_base_camera = stage.T_base_camera(camera)
+    mugs = [
+        instance for instance in renderer.distractors() if instance.prop.kind == "mug" and renderer.is_shown(instance)
+    ]
+    T_base_camera = renderer.T_base_camera(camera)
     while True:
-        instances = stage.draw_instances(camera, arm)
-        pixels = {id(actor): instances == stage.actors.index(actor) for actor in shown + mugs}
+        instances = renderer.draw_instances(camera, arm)
+        pixels = {id(instance): instances == renderer.props.index(instance) for instance in shown + mugs}
         hardly = [
-            actor for actor in shown if _shows_too_little(stage, actor, pixels[id(actor)], T_base_camera, by_shape)
+            instance
+            for instance in shown
+            if _is_too_occluded(renderer, instance, pixels[id(instance)], T_base_camera, by_shape)
         ]
-        hardly += [actor for actor in mugs if not _shows_mark(stage, actor, pixels[id(actor)], T_base_camera)]
+        hardly += [
+            instance for instance in mugs if not _shows_mark(renderer, instance, pixels[id(instance)], T_base_camera)
+        ]
         if not hardly:
-            return tuple(Label(name=actor.prop.kind, mask=pixels[id(actor)]) for actor in shown)
-        for actor in hardly:
-            stage.hide(actor)
-            (mugs if actor in mugs else shown).remove(actor)
+            return tuple(Label(name=instance.prop.kind, mask=pixels[id(instance)]) for instance in shown)
+        for instance in hardly:
+            renderer.hide(instance)
+            (mugs if instance in mugs else shown).remove(instance)
 
 
-def _shows_too_little(stage: Stage, actor: Actor, mask: np.ndarray, T_base_camera: np.ndarray, by_shape: bool) -> bool:
+def _is_too_occluded(
+    renderer: SceneRenderer, instance: PropInstance, mask: np.ndarray, T_base_camera: np.ndarray, by_shape: bool
+) -> bool:
     seen = int(mask.sum())
-    if seen < LEAST_PIXELS:
+    if seen < MIN_PIXELS:
         return True
-    whole = outline(_corners_in_base(stage, actor), T_base_camera, stage.intrinsics)
+    whole = project_outline(_corners_in_base(renderer, instance), T_base_camera, renderer.intrinsics)
     if whole is None:
         return True
-    if by_shape and actor.prop.kind == "bottle" and not _shows_mark(stage, actor, mask, T_base_camera):
+    if by_shape and instance.prop.kind == "bottle" and not _shows_mark(renderer, instance, mask, T_base_camera):
         return True
-    return seen < LEAST_SHARE * 4 * int(np.count_nonzero(whole)) and seen < _LARGE_SHARE * mask.size
+    return seen < MIN_VISIBLE_RATIO * 4 * int(np.count_nonzero(whole)) and seen < _LARGE_RATIO * mask.size
 
 
-def _shows_mark(stage: Stage, actor: Actor, mask: np.ndarray, T_base_camera: np.ndarray) -> bool:
+def _shows_mark(renderer: SceneRenderer, instance: PropInstance, mask: np.ndarray, T_base_camera: np.ndarray) -> bool:
     """True when the pixels `mask` show enough of what tells a bottle or a mug from a cylinder: neck and cap, handle."""
-    corners = _corners_in_base(stage, actor)
-    parts = slice(-2, None) if actor.prop.kind == "bottle" else slice(2, None)
-    mark = outline(corners[parts], T_base_camera, stage.intrinsics)
+    corners = _corners_in_base(renderer, instance)
+    parts = slice(-2, None) if instance.prop.kind == "bottle" else slice(2, None)
+    mark = project_outline(corners[parts], T_base_camera, renderer.intrinsics)
     if mark is None:
         return False
-    if actor.prop.kind == "mug":  # a handle in front of the mug, or behind it, is not seen
-        body = outline(corners[:2], T_base_camera, stage.intrinsics)
-        if body is None or np.count_nonzero(mark & ~body) < LEAST_MARK_SHARE * np.count_nonzero(mark):
+    if instance.prop.kind == "mug":  # a handle in front of the mug, or behind it, is not seen
+        body = project_outline(corners[:2], T_base_camera, renderer.intrinsics)
+        if body is None or np.count_nonzero(mark & ~body) < MIN_MARK_RATIO * np.count_nonzero(mark):
             return False
         mark &= ~body
-    return seen_share(mask, mark) >= LEAST_MARK_SHARE
+    return visible_ratio(mask, mark) >= MIN_MARK_RATIO
 
 
-def _corners_in_base(stage: Stage, actor: Actor) -> list[np.ndarray]:
-    pose = stage.pose(actor)
-    return [points @ pose[:3, :3].T + pose[:3, 3] for points in actor.prop.corners()]
+def _corners_in_base(renderer: SceneRenderer, instance: PropInstance) -> list[np.ndarray]:
+    pose = renderer.pose(instance)
+    return [points @ pose[:3, :3].T + pose[:3, 3] for points in instance.prop.corners()]

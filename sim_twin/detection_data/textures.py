@@ -35,7 +35,7 @@ def _grid(size: int) -> tuple[np.ndarray, np.ndarray]:
     return u, v
 
 
-def _turned(rng: np.random.Generator, size: int) -> tuple[np.ndarray, np.ndarray]:
+def _rotated_grid(rng: np.random.Generator, size: int) -> tuple[np.ndarray, np.ndarray]:
     u, v = _grid(size)
     angle = rng.uniform(0.0, np.pi)
     c, s = np.float32(np.cos(angle)), np.float32(np.sin(angle))
@@ -59,18 +59,18 @@ def _clouds(rng: np.random.Generator, size: int) -> np.ndarray:
 
 
 def _gradient(rng: np.random.Generator, size: int) -> np.ndarray:
-    u, _ = _turned(rng, size)
+    u, _ = _rotated_grid(rng, size)
     return (u - u.min()) / (u.max() - u.min())
 
 
 def _checker(rng: np.random.Generator, size: int) -> np.ndarray:
-    u, v = _turned(rng, size)
+    u, v = _rotated_grid(rng, size)
     cells = rng.integers(2, 14)
     return ((np.floor(u * cells) + np.floor(v * cells)) % 2).astype(np.float32)
 
 
 def _stripes(rng: np.random.Generator, size: int) -> np.ndarray:
-    u, _ = _turned(rng, size)
+    u, _ = _rotated_grid(rng, size)
     wave = np.sin(2 * np.pi * u * rng.uniform(2, 24))
     return (wave > rng.uniform(-0.7, 0.7)).astype(np.float32) if rng.random() < 0.6 else 0.5 + 0.5 * wave
 

@@ -10,9 +10,9 @@ import numpy as np
 
 from hal.base.errors import InvalidValueError
 from hal.base.messages import Intrinsics
-from sim_twin.model.z1_mjcf import BIT_BASE, BIT_HAND, BIT_SCENE, CONTACT_SOLIMP, CONTACT_SOLREF, GROUP_SCENE
+from sim_twin.model.z1_mjcf import BIT_BASE, BIT_GRIPPER, BIT_SCENE, CONTACT_SOLIMP, CONTACT_SOLREF, GROUP_SCENE
 
-PRINT = "board_print"
+PRINT_GEOM = "board_print"
 """Name of the geom that carries the picture."""
 THICKNESS_M = 0.003
 """An aluminium composite plate, as boards are mounted on [m]."""
@@ -73,11 +73,13 @@ class BoardSpec:
 def add_board(spec: mujoco.MjSpec, board: BoardSpec) -> None:
     """Add the plate, which things can touch, and the picture on it, fixed to the table."""
     height, width = board.image.shape
-    texture = spec.add_texture(name=PRINT, type=mujoco.mjtTexture.mjTEXTURE_2D, width=width, height=height, nchannel=3)
+    texture = spec.add_texture(
+        name=PRINT_GEOM, type=mujoco.mjtTexture.mjTEXTURE_2D, width=width, height=height, nchannel=3
+    )
     texture.data = np.ascontiguousarray(np.repeat(board.image[..., None], 3, axis=2)).tobytes()
     # No gloss, and one copy of the picture over the whole face
-    material = spec.add_material(name=PRINT, specular=0.0, shininess=0.0, texuniform=False, texrepeat=[1, 1])
-    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = PRINT
+    material = spec.add_material(name=PRINT_GEOM, specular=0.0, shininess=0.0, texuniform=False, texrepeat=[1, 1])
+    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = PRINT_GEOM
     # MuJoCo lays a picture on a box with its right along x and its top along y
     T_base_board = board.T_base_board()
     quat = np.empty(4)
@@ -90,18 +92,18 @@ def add_board(spec: mujoco.MjSpec, board: BoardSpec) -> None:
         size=[half_width_m + MARGIN_M, half_height_m + MARGIN_M, THICKNESS_M / 2],
         rgba=(0.95, 0.95, 0.95, 1.0),
         contype=BIT_SCENE,
-        conaffinity=BIT_SCENE | BIT_BASE | BIT_HAND,
+        conaffinity=BIT_SCENE | BIT_BASE | BIT_GRIPPER,
         solref=CONTACT_SOLREF,
         solimp=CONTACT_SOLIMP,
         **common,
     )
     spec.worldbody.add_geom(
-        name=PRINT,
+        name=PRINT_GEOM,
         pos=[board.x_m, board.y_m, THICKNESS_M],
         size=[half_width_m, half_height_m, _INK_M],
         contype=0,
         conaffinity=0,
-        material=PRINT,
+        material=PRINT_GEOM,
         **common,
     )
 

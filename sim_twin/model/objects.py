@@ -6,8 +6,8 @@ import mujoco
 import numpy as np
 
 from sim_twin.model.more_objects import EXTENDED
-from sim_twin.model.parts import GraspObject, Part, lathe
-from sim_twin.model.z1_mjcf import BIT_BASE, BIT_HAND, BIT_SCENE, CONTACT_SOLIMP, CONTACT_SOLREF, GROUP_SCENE
+from sim_twin.model.parts import GraspObject, Part, make_lathe
+from sim_twin.model.z1_mjcf import BIT_BASE, BIT_GRIPPER, BIT_SCENE, CONTACT_SOLIMP, CONTACT_SOLREF, GROUP_SCENE
 
 OBJECT_BODY = "object"
 
@@ -32,7 +32,7 @@ _PAPER: dict[str, GraspObject] = {
     # moves the centre of mass by a few millimetres.
     "bottle": GraspObject(
         height_m=0.200,
-        parts=lathe(
+        parts=make_lathe(
             _BOTTLE_PROFILE,
             ((0.014, _PET), (0.199, _PET), (0.076, _LABEL), (0.005, _PET), (0.003, _PET), (0.003, _CAP)),
         ),
@@ -75,7 +75,7 @@ def add_object(
             mass=mass_factor * part.mass_kg,
             rgba=part.rgba,
             contype=BIT_SCENE,
-            conaffinity=BIT_SCENE | BIT_BASE | BIT_HAND,
+            conaffinity=BIT_SCENE | BIT_BASE | BIT_GRIPPER,
             condim=4,
             friction=_FRICTION,
             solref=CONTACT_SOLREF,

@@ -82,7 +82,7 @@ class GraspObject:
         return np.vstack([part.corners() for part in self.parts])
 
 
-def lathe(profile: tuple[tuple[float, float], ...], parts: tuple[tuple[float, tuple], ...]) -> tuple[Part, ...]:
+def make_lathe(profile: tuple[tuple[float, float], ...], parts: tuple[tuple[float, tuple], ...]) -> tuple[Part, ...]:
     """Return one part per segment of a profile of (height, radius) [m], heights from the foot.
 
     Args:
@@ -97,13 +97,13 @@ def lathe(profile: tuple[tuple[float, float], ...], parts: tuple[tuple[float, tu
     return tuple(made)
 
 
-def turned(profile: tuple[tuple[float, float], ...], mass_kg: float, rgba: Rgba) -> tuple[Part, ...]:
-    """Return the parts of a `lathe` profile that is one stuff throughout: each weighs by its volume."""
+def make_homogeneous_lathe(profile: tuple[tuple[float, float], ...], mass_kg: float, rgba: Rgba) -> tuple[Part, ...]:
+    """Return the parts of a `make_lathe` profile that is one stuff throughout: each weighs by its volume."""
     volumes = np.array([(z1 - z0) * (r0 * r0 + r0 * r1 + r1 * r1) for (z0, r0), (z1, r1) in pairwise(profile)])
-    return lathe(profile, tuple((float(share), rgba) for share in mass_kg * volumes / volumes.sum()))
+    return make_lathe(profile, tuple((float(share), rgba) for share in mass_kg * volumes / volumes.sum()))
 
 
-def wall(
+def make_wall(
     low: tuple[float, float], high: tuple[float, float], z_m: tuple[float, float], mass_kg: float, rgba: Rgba
 ) -> tuple[Part, ...]:
     """Return a round wall open above and below, as staves with no gaps between them.

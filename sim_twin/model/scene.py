@@ -15,7 +15,7 @@ from hal.base.errors import InvalidValueError
 from sim_twin.model.charuco_board import BoardSpec, add_board
 from sim_twin.model.objects import OBJECT_BODY, OBJECT_NAMES, OBJECTS, add_object
 from sim_twin.model.parts import GraspObject
-from sim_twin.model.z1_mjcf import BIT_BASE, BIT_HAND, BIT_SCENE, CONTACT_SOLIMP, CONTACT_SOLREF, GROUP_SCENE, add_z1
+from sim_twin.model.z1_mjcf import BIT_BASE, BIT_GRIPPER, BIT_SCENE, CONTACT_SOLIMP, CONTACT_SOLREF, GROUP_SCENE, add_z1
 
 PHYSICS_PERIOD_S = z1.CONTROL_PERIOD_S / 2
 """Two physics steps in a control period: contacts of 4 ms time constant need steps of 2 ms or less [s]."""
@@ -257,7 +257,7 @@ def _add_surroundings(spec: mujoco.MjSpec) -> None:
         pos=[0.35, 0.0, -0.02],
         size=[0.65, 0.60, 0.02],
         contype=BIT_SCENE,
-        conaffinity=BIT_SCENE | BIT_BASE | BIT_HAND,
+        conaffinity=BIT_SCENE | BIT_BASE | BIT_GRIPPER,
         friction=_TABLE_FRICTION,
         solref=CONTACT_SOLREF,
         solimp=CONTACT_SOLIMP,

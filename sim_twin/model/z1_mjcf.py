@@ -24,7 +24,7 @@ GROUP_MOUNT = 4
 
 # Collision classes: `contype`, `conaffinity`. Upper arm and forearm do not collide with each other: the vendor's joint
 # limits keep them apart, and their hulls overlap at the joints.
-BIT_SCENE, BIT_BASE, BIT_HAND = 1, 2, 4
+BIT_SCENE, BIT_BASE, BIT_GRIPPER = 1, 2, 4
 
 JAW_FRICTION = (1.0, 0.01, 0.001)
 """Sliding [1], torsional [m], rolling [m]. Rubber pad on plastic or card: 0.8 to 1.2 in tables of friction; torsional:
@@ -181,8 +181,8 @@ def _add_geoms(spec: mujoco.MjSpec, body: mujoco.MjsBody, name: str) -> None:
             type=mujoco.mjtGeom.mjGEOM_MESH,
             meshname=piece.name,
             group=GROUP_ARM,
-            contype=BIT_HAND if hand else BIT_BASE,
-            conaffinity=BIT_SCENE | (BIT_BASE if hand else BIT_HAND),
+            contype=BIT_GRIPPER if hand else BIT_BASE,
+            conaffinity=BIT_SCENE | (BIT_BASE if hand else BIT_GRIPPER),
             condim=6 if jaw else 3,
             priority=1 if jaw else 0,
             friction=JAW_FRICTION if jaw else (0.3, 0.005, 0.0001),
@@ -199,7 +199,7 @@ def _add_mount(flange: mujoco.MjsBody, pose: np.ndarray) -> None:
     camera = flange.add_body(name="camera", pos=pose[:3, 3], quat=quat, gravcomp=1.0)
     common = {
         "group": GROUP_MOUNT,
-        "contype": BIT_HAND,
+        "contype": BIT_GRIPPER,
         "conaffinity": BIT_SCENE | BIT_BASE,
         "type": mujoco.mjtGeom.mjGEOM_BOX,
     }

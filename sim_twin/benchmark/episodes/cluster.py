@@ -10,7 +10,7 @@ from typing import Any
 
 from hal.base.errors import Z1Error
 from sim_twin.benchmark.episodes.rows import Row
-from sim_twin.benchmark.episodes.runner import ONE_THREAD, Task, one_thread, run_task
+from sim_twin.benchmark.episodes.runner import SINGLE_THREAD_ENV, Task, limit_threads, run_task
 
 _ROOMS = ("hal", "models", "calibration", "z1_runtime", "sim_twin")
 _ROOT = Path(__file__).parents[3]
@@ -56,12 +56,12 @@ def run_tasks_on_ray(tasks: Sequence[Task], address: str) -> Iterator[list[Row]]
         cores = int(ray.cluster_resources().get("CPU", 0))
         if not cores:
             raise ClusterError(f"the Ray cluster at {address!r} has no CPU; it has {ray.cluster_resources()}.")
-        yield from _in_order_of_ending(ray, tasks, _AHEAD * cores)
+        yield from _iterate_completed(ray, tasks, _AHEAD * cores)
     finally:
         ray.shutdown()
 
 
-def _in_order_of_ending(ray: Any, tasks: Sequence[Task], ahead: int) -> Iterator[list[Row]]:
+def _iterate_completed(ray: Any, tasks: Sequence[Task], ahead: int) -> Iterator[list[Row]]:
     remote = ray.remote(num_cpus=1)(_run_on_worker)
     waiting = iter(tasks)
     running = [remote.remote(task) for task in islice(waiting, ahead)]
@@ -72,7 +72,7 @@ def _in_order_of_ending(ray: Any, tasks: Sequence[Task], ahead: int) -> Iterator
 
 
 def _run_on_worker(task: Task) -> list[Row]:
-    one_thread()
+    limit_threads()
     return run_task(task)
 
 
@@ -80,7 +80,7 @@ def _environment() -> dict[str, Any]:
     return {
         "py_modules": [str(_ROOT / room) for room in _ROOMS],
         "excludes": ["**/__pycache__"],
-        "env_vars": dict(ONE_THREAD),
+        "env_vars": dict(SINGLE_THREAD_ENV),
     }
 
 

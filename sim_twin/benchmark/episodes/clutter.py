@@ -9,7 +9,7 @@ import numpy as np
 from sim_twin.model.objects import OBJECTS
 from sim_twin.model.scene import Neighbour, SceneConfig
 
-MOST = 3
+MAX_NEIGHBOURS = 3
 """Neighbours that an object may have."""
 GAP_M = (0.070, 0.130)
 """Free table between the object's outermost point and a neighbour's: a hand has room, and may still hit it."""

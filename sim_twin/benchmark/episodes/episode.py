@@ -11,13 +11,13 @@ import numpy as np
 from hal.base.errors import HalError
 from hal.base.messages import RgbdFrame
 from models.obb.obb import DegenerateCloudError
+from sim_twin.benchmark.episodes.execution import RETRIED, EpisodeRobot, Mode, Outcome, capture
 from sim_twin.benchmark.episodes.methods import Method, file_name
 from sim_twin.benchmark.episodes.occlusion import occlude
 from sim_twin.benchmark.episodes.recordings import Recordings, record
 from sim_twin.benchmark.episodes.rows import Attempt, Row, make_row
 from sim_twin.benchmark.episodes.scenarios import Scenario
-from sim_twin.benchmark.episodes.seen import SharedObservation
-from sim_twin.benchmark.episodes.trial import RETRIED, Mode, Outcome, Robot, look
+from sim_twin.benchmark.episodes.shared_observation import SharedObservation
 from z1_runtime.motion.executor import MotionError
 from z1_runtime.perception.point_cloud import PerceptionError
 from z1_runtime.planning.planner import NoPlanError
@@ -46,7 +46,7 @@ def run_scenario(
         recordings: which episodes are written for Rerun too.
     """
     decider = make_grasp_selector(scenario, scenario.draw_seed)
-    seen = _first_look(scenario, decider)
+    seen = _observe_first(scenario, decider)
     if isinstance(seen, Attempt):
         return [make_row(scenario, method.name, [seen], top_k=top_k) for method in methods]
     return [
@@ -56,13 +56,13 @@ def run_scenario(
 
 
 def record_scenario(scenario: Scenario, method: Method, make_grasp_selector: MakeDecider, folder: Path) -> Path | None:
-    """Write what `method` sees, ranks and chooses at its first look as <scenario>-<method>.rrd in `folder`.
+    """Write what `method` sees, ranks and chooses at its first capture as <scenario>-<method>.rrd in `folder`.
 
     Returns:
         The file, or None where nothing is seen.
     """
     decider = make_grasp_selector(scenario, scenario.draw_seed)
-    seen = _first_look(scenario, decider)
+    seen = _observe_first(scenario, decider)
     if isinstance(seen, Attempt):
         return None
     return record(folder / recording_name(scenario, method), _decide(method, decider, seen))
@@ -73,13 +73,15 @@ def recording_name(scenario: Scenario, method: Method) -> str:
     return f"{scenario.key}-{file_name(method.name)}.rrd"
 
 
-def _first_look(scenario: Scenario, decider: GraspSelector) -> SharedObservation | Attempt:
+def _observe_first(scenario: Scenario, decider: GraspSelector) -> SharedObservation | Attempt:
     """Return what is seen from home, or the attempt that ended with the look."""
-    frame, q = look(scenario.scene())
-    return _see(scenario, decider, frame, q)
+    frame, q = capture(scenario.scene())
+    return _observe(scenario, decider, frame, q)
 
 
-def _see(scenario: Scenario, decider: GraspSelector, frame: RgbdFrame, q: np.ndarray) -> SharedObservation | Attempt:
+def _observe(
+    scenario: Scenario, decider: GraspSelector, frame: RgbdFrame, q: np.ndarray
+) -> SharedObservation | Attempt:
     times = StageTimes()
     try:
         return SharedObservation.by(decider, occlude(frame, scenario.occlusion, scenario.draw_seed), q, times)
@@ -104,8 +106,8 @@ def _run_method(
     first = _decide(method, decider, seen)
     attempts, given_up, qpos = [first], "", None
     if first.plan is not None:
-        with Robot(scenario.scene(), decider.kinematics, decider.config.speed) as robot:
-            attempts, given_up = _act(scenario, method, make_grasp_selector, robot, first, top_k=top_k)
+        with EpisodeRobot(scenario.scene(), decider.kinematics, decider.config.speed) as robot:
+            attempts, given_up = _execute_attempts(scenario, method, make_grasp_selector, robot, first, top_k=top_k)
             qpos = robot.world.data.qpos.copy()
     row = make_row(scenario, method.name, attempts, top_k=top_k, given_up=given_up, qpos=qpos)
     if recordings is not None and recordings.wants(success=row["success"]):
@@ -113,16 +115,22 @@ def _run_method(
     return row
 
 
-def _act(
-    scenario: Scenario, method: Method, make_grasp_selector: MakeDecider, robot: Robot, first: Attempt, *, top_k: int
+def _execute_attempts(
+    scenario: Scenario,
+    method: Method,
+    make_grasp_selector: MakeDecider,
+    robot: EpisodeRobot,
+    first: Attempt,
+    *,
+    top_k: int,
 ) -> tuple[list[Attempt], str]:
-    """Execute `first` and, after a failure, what is decided on another look; return all attempts and why it was left
+    """Execute `first` and, after a failure, what is decided on another capture; return all attempts and why it was left
     at them."""
     attempt = first
     attempts: list[Attempt] = []
     while True:
         assert attempt.plan is not None
-        outcome = robot.act(attempt.plan)
+        outcome = robot.execute(attempt.plan)
         attempts.append(replace(attempt, outcome=outcome))
         if outcome.mode not in RETRIED or len(attempts) == top_k:
             return attempts, ""
@@ -130,8 +138,8 @@ def _act(
         try:
             robot.withdraw(attempt.plan, outcome, decider.config.jaw_home)
             if len(attempts) == 1:
-                robot.look()  # this robot's first frame would have the noise of the episode's first look
-            found = _see(scenario, decider, *robot.look())
+                robot.capture()  # this robot's first frame would have the noise of the episode's first look
+            found = _observe(scenario, decider, *robot.capture())
         except (MotionError, HalError) as error:
             return attempts, f"{Mode.STOPPED.value}: {error}"
         attempt = found if isinstance(found, Attempt) else _decide(method, decider, found)

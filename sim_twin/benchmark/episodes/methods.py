@@ -11,7 +11,7 @@ import numpy as np
 from hal.base.errors import InvalidValueError
 from models.obb.mvbb import FitMethod, RankedGrasps, fit_obb, rank_by_score, rank_grasps
 from models.types import GraspSet
-from sim_twin.benchmark.episodes.seen import SharedObservation
+from sim_twin.benchmark.episodes.shared_observation import SharedObservation
 from z1_runtime.grasping.ranking import Ranking, ScoringHead, load_scoring
 from z1_runtime.tasks.grasp_selection import GraspSelector, StageTimes
 

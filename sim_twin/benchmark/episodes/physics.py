@@ -26,7 +26,7 @@ class Physics:
     arm_latency_s: float = 0.0
 
     @classmethod
-    def drawn(cls, seed: int) -> Physics:
+    def sample(cls, seed: int) -> Physics:
         """Return the deviations that belong to `seed`."""
         rng = np.random.default_rng([seed, 0xF0])  # a stream of its own: the camera's noise has the bare seed
         friction, mass = rng.uniform(1.0 - SPREAD, 1.0 + SPREAD, 2)

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 
 from models.obb.mvbb import RankedGrasps
+from sim_twin.benchmark.episodes.execution import Mode, Outcome
 from sim_twin.benchmark.episodes.scenarios import Scenario
-from sim_twin.benchmark.episodes.seen import SharedObservation
-from sim_twin.benchmark.episodes.targeting import overlap
-from sim_twin.benchmark.episodes.trial import Mode, Outcome
+from sim_twin.benchmark.episodes.shared_observation import SharedObservation
+from sim_twin.benchmark.episodes.targeting import compute_iou
 from z1_runtime.grasping.features import FEATURES
 from z1_runtime.tasks.grasp_selection import StageTimes
 from z1_runtime.types import GraspPlan, Rejection
@@ -65,7 +65,7 @@ def make_row(
     What a look, a decision and its outcome are told by is that of the last attempt; `success_top1` is of the first.
 
     Args:
-        scenario: `object`, `distance`, …, and the physics and neighbours that were drawn for it.
+        scenario: `object`, `distance`, …, and the physics and neighbours that were sample for it.
         method: its name.
         attempts: one or more; `attempts`, `modes` and `ranks` tell of each, `success_after` (top_k,) whether the object
             was lifted within one, two, … of them.
@@ -89,7 +89,7 @@ def make_row(
     row |= {f"{stage}_ms": ms for stage, ms in last.times.ms.items()}
     reasons = Counter(rejection.reason for rejection in last.rejections)
     row |= {f"rejected_{reason}": reasons[reason] for reason in REASONS}
-    row |= _of_look(last.seen) | _of_ranking(last) | _of_plan(last) | _of_features(last)
+    row |= _observation_columns(last.seen) | _ranking_columns(last) | _plan_columns(last) | _feature_columns(last)
     return row if qpos is None else row | {"final_qpos": qpos.tolist()}
 
 
@@ -102,7 +102,7 @@ def _version() -> str:
     return version("z1-grasp")
 
 
-def _of_look(seen: SharedObservation | None) -> Row:
+def _observation_columns(seen: SharedObservation | None) -> Row:
     if seen is None:
         return {}
     detection, truth = seen.observation.detection, seen.frame.ground_truth_mask
@@ -111,11 +111,11 @@ def _of_look(seen: SharedObservation | None) -> Row:
         "n_candidates": len(seen.candidates),
         "detection_label": detection.label,
         "detection_confidence": detection.confidence,
-        "iou": float("nan") if truth is None else overlap(detection, truth),
+        "iou": float("nan") if truth is None else compute_iou(detection, truth),
     }
 
 
-def _of_ranking(attempt: Attempt) -> Row:
+def _ranking_columns(attempt: Attempt) -> Row:
     ranked, seen, left = attempt.ranked, attempt.seen, attempt.left
     if ranked is None or seen is None or left is None:
         return {}
@@ -127,7 +127,7 @@ def _of_ranking(attempt: Attempt) -> Row:
     return row
 
 
-def _of_plan(attempt: Attempt) -> Row:
+def _plan_columns(attempt: Attempt) -> Row:
     plan, ranked, left = attempt.plan, attempt.ranked, attempt.left
     if plan is None or ranked is None or left is None:
         return {}
@@ -145,7 +145,7 @@ def _of_plan(attempt: Attempt) -> Row:
     }
 
 
-def _of_features(attempt: Attempt) -> Row:
+def _feature_columns(attempt: Attempt) -> Row:
     """Return what a scoring head is fitted to: of the first-ranked grasp `first_…`, of the executed one `grasp_…`."""
     ranked, left, features = attempt.ranked, attempt.left, attempt.features
     if ranked is None or left is None or features is None:

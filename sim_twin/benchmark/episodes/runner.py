@@ -18,7 +18,7 @@ from sim_twin.benchmark.episodes.methods import Method
 from sim_twin.benchmark.episodes.recordings import Recordings
 from sim_twin.benchmark.episodes.rows import Row
 from sim_twin.benchmark.episodes.scenarios import Scenario
-from sim_twin.benchmark.episodes.targeting import aim
+from sim_twin.benchmark.episodes.targeting import select_target
 from z1_runtime.config import RuntimeConfig
 
 if TYPE_CHECKING:
@@ -26,7 +26,9 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-ONE_THREAD = {name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")}
+SINGLE_THREAD_ENV = {
+    name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+}
 """Environment of a process that shall keep to one core: the workers themselves fill the machine."""
 
 
@@ -84,11 +86,14 @@ def run_tasks(tasks: Sequence[T], jobs: int, run: Callable[[T], list[Row]] = run
     # A fresh interpreter for each: forked ones would share OpenGL and torch with this one.
     context = multiprocessing.get_context("spawn")
     jobs = min(jobs, max(len(tasks), 1))
-    with environment(ONE_THREAD), ProcessPoolExecutor(jobs, mp_context=context, initializer=one_thread) as pool:
-        yield from _in_order_of_ending(pool, tasks, 2 * jobs, run)
+    with (
+        set_environment(SINGLE_THREAD_ENV),
+        ProcessPoolExecutor(jobs, mp_context=context, initializer=limit_threads) as pool,
+    ):
+        yield from _iterate_completed(pool, tasks, 2 * jobs, run)
 
 
-def _in_order_of_ending(
+def _iterate_completed(
     pool: Executor, tasks: Sequence[T], ahead: int, run: Callable[[T], list[Row]]
 ) -> Iterator[list[Row]]:
     waiting = iter(tasks)
@@ -101,7 +106,7 @@ def _in_order_of_ending(
 
 
 @contextmanager
-def environment(variables: Mapping[str, str]) -> Iterator[None]:
+def set_environment(variables: Mapping[str, str]) -> Iterator[None]:
     """Set environment variables while the body runs: a child reads them before it can be told anything."""
     before = {name: os.environ.get(name) for name in variables}
     os.environ.update(variables)
@@ -115,7 +120,7 @@ def environment(variables: Mapping[str, str]) -> Iterator[None]:
                 os.environ[name] = value
 
 
-def one_thread() -> None:
+def limit_threads() -> None:
     """Keep what heeds no variable to one thread too."""
     import cv2
 
@@ -128,7 +133,7 @@ def make_grasp_selector(config: RuntimeConfig, scenario: Scenario, seed: int) ->
     from z1_runtime.tasks.grasp_selection import GraspSelector
 
     base = _assembled(replace(config, seed=0))
-    config, detector = aim(replace(config, seed=seed), base.perception.detector, scenario)
+    config, detector = select_target(replace(config, seed=seed), base.perception.detector, scenario)
     perception = base.perception
     if detector is not perception.detector:
         perception = Perception(config.perception, detector, base.T_flange_camera)

@@ -9,7 +9,7 @@ from itertools import product
 from typing import Any
 
 from hal.base.errors import InvalidValueError
-from sim_twin.benchmark.episodes.clutter import MOST, draw_neighbours
+from sim_twin.benchmark.episodes.clutter import MAX_NEIGHBOURS, draw_neighbours
 from sim_twin.benchmark.episodes.physics import Physics
 from sim_twin.model.objects import EXTENDED_OBJECTS, OBJECT_NAMES, PAPER_OBJECTS
 from sim_twin.model.parts import GraspObject
@@ -50,15 +50,15 @@ class Scenario:
 
     def __post_init__(self) -> None:
         if self.shape is None:
-            _one_of("object", self.object, OBJECT_NAMES)
-        _one_of("distance", self.distance, tuple(DISTANCES_M))
-        _one_of("lateral", self.lateral, tuple(LATERALS_M))
+            _check_choice("object", self.object, OBJECT_NAMES)
+        _check_choice("distance", self.distance, tuple(DISTANCES_M))
+        _check_choice("lateral", self.lateral, tuple(LATERALS_M))
         if not 0.0 <= self.occlusion < 1.0:
             raise InvalidValueError(f"occlusion is {self.occlusion!r}; allowed is 0 up to, not including, 1.")
         if self.seed < 0:
             raise InvalidValueError(f"seed is {self.seed}; allowed is 0 or more.")
-        if not 0 <= self.clutter <= MOST:
-            raise InvalidValueError(f"clutter is {self.clutter}; allowed is 0 to {MOST} neighbours.")
+        if not 0 <= self.clutter <= MAX_NEIGHBOURS:
+            raise InvalidValueError(f"clutter is {self.clutter}; allowed is 0 to {MAX_NEIGHBOURS} neighbours.")
 
     @property
     def key(self) -> str:
@@ -76,7 +76,7 @@ class Scenario:
     @property
     def physics(self) -> Physics:
         """What the world has otherwise than the runtime believes."""
-        return Physics.drawn(self.draw_seed) if self.physics_noise else Physics()
+        return Physics.sample(self.draw_seed) if self.physics_noise else Physics()
 
     def scene(self) -> SceneConfig:
         """Return the twin's scene."""
@@ -148,6 +148,6 @@ def grid(
     ]
 
 
-def _one_of(name: str, value: str, allowed: Sequence[str]) -> None:
+def _check_choice(name: str, value: str, allowed: Sequence[str]) -> None:
     if value not in allowed:
         raise InvalidValueError(f"there is no {name} {value!r}; choose one of: {', '.join(allowed)}.")

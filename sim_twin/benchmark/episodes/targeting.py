@@ -16,7 +16,7 @@ from z1_runtime.config import RuntimeConfig
 from z1_runtime.perception.detectors import Detector, TabletopDetector
 
 
-def aim(config: RuntimeConfig, detector: Detector, scenario: Scenario) -> tuple[RuntimeConfig, Detector]:
+def select_target(config: RuntimeConfig, detector: Detector, scenario: Scenario) -> tuple[RuntimeConfig, Detector]:
     """Return the configuration and the detector with which `scenario` is seen.
 
     A detector that knows the object's class is told it as a user would; one that knows none takes, among neighbours,
@@ -31,10 +31,10 @@ def aim(config: RuntimeConfig, detector: Detector, scenario: Scenario) -> tuple[
         return replace(config, object_class=scenario.object), detector
     if detector.classes and not config.object_class:
         detector = TabletopDetector()
-    return config, PointedDetector(detector) if scenario.clutter else detector
+    return config, TargetDetector(detector) if scenario.clutter else detector
 
 
-class PointedDetector:
+class TargetDetector:
     """Of what another detector finds, what covers most of the object that the twin says is meant."""
 
     def __init__(self, detector: Detector) -> None:
@@ -46,12 +46,12 @@ class PointedDetector:
         if frame.ground_truth_mask is None:
             raise InvalidValueError("only the twin's frames say which object is meant.")
         found = self._detector.detect(frame, T_base_camera)
-        overlaps = [overlap(detection, frame.ground_truth_mask) for detection in found]
+        overlaps = [compute_iou(detection, frame.ground_truth_mask) for detection in found]
         best = int(np.argmax(overlaps)) if found else -1
         return [found[best]] if found and overlaps[best] > 0.0 else []
 
 
-def overlap(detection: Detection, truth: np.ndarray) -> float:
+def compute_iou(detection: Detection, truth: np.ndarray) -> float:
     """Return how well a detection, by its mask or else its box, meets the `truth` (H, W): area shared over area of
     either."""
     mask = detection.mask

@@ -68,7 +68,7 @@ def _pairs(surface: Surface, config: SweepConfig) -> tuple[np.ndarray, np.ndarra
     aside[:: config.n_directions] = 0.0
     directions = _unit(aside - normals)
     here = -np.sum(directions * normals, axis=1)
-    ends = surface.chords(points, directions)
+    ends = surface.trace_chords(points, directions)
     found = []
     for end in ends:
         there = np.sum(directions * end.normals, axis=1)
@@ -78,11 +78,11 @@ def _pairs(surface: Surface, config: SweepConfig) -> tuple[np.ndarray, np.ndarra
         found.append((0.5 * (points + end.points), directions, widths, 1.0 - angle / config.cone_rad, good))
     middles, directions, widths, square, good = (np.concatenate(parts) for parts in zip(*found, strict=True))
     middles, directions, widths, square = middles[good], directions[good], widths[good], square[good]
-    kept = _one_of_each(middles, directions, square, config)
+    kept = _deduplicate(middles, directions, square, config)
     return middles[kept], directions[kept], widths[kept], square[kept]
 
 
-def _one_of_each(middles: np.ndarray, directions: np.ndarray, scores: np.ndarray, config: SweepConfig) -> np.ndarray:
+def _deduplicate(middles: np.ndarray, directions: np.ndarray, scores: np.ndarray, config: SweepConfig) -> np.ndarray:
     """Return the indices of the best of each cell of middles (K, 3) and directions (K, 3), whose sign means nothing."""
     upwards = directions * np.where(directions @ [0.31, 0.47, 0.83] < 0.0, -1.0, 1.0)[:, None]
     cells = np.column_stack([np.floor(middles / config.cell_m), np.round(upwards / config.cell_sine)]).astype(int)

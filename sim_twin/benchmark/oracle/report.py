@@ -133,8 +133,8 @@ def _against(rows: Sequence[Row], others: Sequence[Row]) -> dict[str, Any]:
 
 def _place(row: Row) -> tuple[Any, ...]:
     """Return what makes two episodes one scene; clutter and physics are drawn anew for each seed."""
-    drawn = row["seed"] if row["clutter"] or row["physics_noise"] else 0
-    return *(row[column] for column in _PLACE if column != "occlusion"), drawn
+    sample = row["seed"] if row["clutter"] or row["physics_noise"] else 0
+    return *(row[column] for column in _PLACE if column != "occlusion"), sample
 
 
 def _by_table(column: str, tallies: Mapping[str, Any]) -> str:

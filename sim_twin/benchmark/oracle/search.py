@@ -14,11 +14,11 @@ from importlib.metadata import version
 
 from hal.base.clock import Stopwatch
 from hal.base.errors import InvalidValueError
+from sim_twin.benchmark.episodes.execution import EpisodeRobot, Mode, Outcome
 from sim_twin.benchmark.episodes.rows import REASONS, Row
 from sim_twin.benchmark.episodes.scenarios import Scenario
-from sim_twin.benchmark.episodes.trial import Mode, Outcome, Robot
 from sim_twin.benchmark.oracle.candidates import SweepConfig
-from sim_twin.benchmark.oracle.options import EXACT_PLANNER, Options, TrueScene
+from sim_twin.benchmark.oracle.reachable_grasps import EXACT_PLANNER, GraspQueue, GroundTruthScene
 from z1_runtime.geometry.kinematics import Kinematics
 from z1_runtime.planning.pick_motion import CandidateRejected
 from z1_runtime.planning.planner_config import PlannerConfig
@@ -80,55 +80,55 @@ def search(scenario: Scenario, config: OracleConfig) -> Row:
     the gripper, and the ways to lay it (two a grasp) that the arm can go.
     """
     watch = Stopwatch()
-    hunt = _Hunt(scenario, config)
-    for _ in hunt.run():
+    search_run = _Search(scenario, config)
+    for _ in search_run.run():
         pass
     row: Row = {**scenario.features(), "method": METHOD, "version": version("z1-grasp")}
-    return row | hunt.report() | {"search_ms": watch.lap_ms()}
+    return row | search_run.report() | {"search_ms": watch.lap_ms()}
 
 
-class _Hunt:
+class _Search:
     """One scenario's search."""
 
     def __init__(self, scenario: Scenario, config: OracleConfig) -> None:
         self._scene, self._config = scenario.scene(), config
-        self._truth = TrueScene(self._scene, _kinematics(), config.planner, config.speed)
-        self._counted: Options | None = None
+        self._ground_truth = GroundTruthScene(self._scene, _kinematics(), config.planner, config.speed)
+        self._counted: GraspQueue | None = None
         self._modes: list[Mode] = []
-        self._refused: Counter[str] = Counter()
+        self._rejected: Counter[str] = Counter()
         self._last: tuple[GraspPlan, Outcome] | None = None
         self._exhausted = False
 
     def run(self) -> Iterator[Outcome]:
         """Yield the outcome of each execution; end with the first success, or when options or budget are spent."""
-        options = self._counted = self._truth.options(self._config.sweep)
+        find_grasps = self._counted = self._ground_truth.find_grasps(self._config.sweep)
         finer = False
         while not self._is_over():
-            choice = None if not finer and len(self._modes) >= self._config.finer_after else options.next()
+            choice = None if not finer and len(self._modes) >= self._config.finer_after else find_grasps.next()
             if choice is None and finer:
                 self._exhausted = True
                 return
             if choice is None:
-                options, finer = options.joined(self._truth.options(self._config.finer)), True
+                find_grasps, finer = find_grasps.with_failures(self._ground_truth.find_grasps(self._config.finer)), True
                 continue
             try:
-                plan = self._truth.plan(choice)
-            except CandidateRejected as refusal:
-                self._refused[refusal.reason] += 1
-                options.fail(choice)
+                plan = self._ground_truth.plan(choice)
+            except CandidateRejected as rejection:
+                self._rejected[rejection.reason] += 1
+                find_grasps.add_failure(choice)
                 continue
             outcome = self._execute(plan)
-            options.fail(choice)
+            find_grasps.add_failure(choice)
             yield outcome
 
     def _is_over(self) -> bool:
         config = self._config
         solved = bool(self._modes) and self._modes[-1] is Mode.SUCCESS
-        return solved or len(self._modes) >= config.executions or self._refused.total() >= config.plannings
+        return solved or len(self._modes) >= config.executions or self._rejected.total() >= config.plannings
 
     def _execute(self, plan: GraspPlan) -> Outcome:
-        with Robot(self._scene, self._truth.kinematics, self._config.speed) as robot:
-            outcome = robot.act(plan)
+        with EpisodeRobot(self._scene, self._ground_truth.kinematics, self._config.speed) as robot:
+            outcome = robot.execute(plan)
         self._modes.append(outcome.mode)
         self._last = plan, outcome
         return outcome
@@ -148,7 +148,7 @@ class _Hunt:
             "n_clear": counted.n_clear,
             "n_reachable": len(counted),
         }
-        row |= {f"rejected_{reason}": counted.rejected[reason] + self._refused[reason] for reason in REASONS}
+        row |= {f"rejected_{reason}": counted.rejected[reason] + self._rejected[reason] for reason in REASONS}
         if self._last is None:
             return row
         plan, outcome = self._last

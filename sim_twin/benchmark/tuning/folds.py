@@ -31,7 +31,7 @@ def require_sklearn() -> None:
         ) from error
 
 
-def folds_of(groups: Sequence[str] | np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+def make_folds(groups: Sequence[str] | np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Yield indices to fit on and to judge on, 5 times or once for each group if there are fewer.
 
     No group stands on both sides: the same pose under two seeds is nearly the same scenario. Two at least are needed;

@@ -12,10 +12,10 @@ import numpy as np
 
 from sim_twin.benchmark.episodes.methods import METHODS
 from sim_twin.benchmark.episodes.rows import Row
-from sim_twin.benchmark.tuning.judge import Proposal
-from sim_twin.benchmark.tuning.rows import Reading, known_grasps, outcomes, pose_of
+from sim_twin.benchmark.tuning.evaluation import Proposal
+from sim_twin.benchmark.tuning.logged_episodes import Reading, collect_outcomes, labelled_grasps, scenario_pose
 from sim_twin.benchmark.tuning.thresholds import Threshold, fit_threshold
-from sim_twin.benchmark.tuning.variants import Variants, choose, variants_of
+from sim_twin.benchmark.tuning.variants import Variants, find_variants, select_variant
 from z1_runtime.config import RuntimeConfig, hand_set
 from z1_runtime.grasping.ranking import Ranking, Scoring, ScoringHead, save_scoring
 
@@ -27,7 +27,7 @@ FAMILIES = ("mvb", "full")
 class Draft:
     """What the training rows say of one method."""
 
-    hand: Ranking
+    baseline: Ranking
     """Set by hand."""
     variants: Variants
     rankings: Mapping[str, Ranking]
@@ -38,7 +38,7 @@ class Draft:
     """None, one without a head, one with it, or both."""
 
 
-def hand_ranking(name: str, config: RuntimeConfig) -> Ranking:
+def baseline_ranking(name: str, config: RuntimeConfig) -> Ranking:
     """Return the numbers set by hand that the method `name` ranks by."""
     return METHODS[name].ranking(hand_set(config))
 
@@ -55,33 +55,36 @@ def draft(
     """Return what `train` proposes for the method `name`.
 
     Args:
-        name: one of `FAMILIES`, with episodes under its hand-set values.
+        name: one of `FAMILIES`, with episodes under its baseline-set values.
         train: rows of all methods.
         config: what they were run with.
         reading: in which successes are counted.
         head: proposed in addition to the rest.
         folder: where proposals that no logged method stands for are written, as scoring files.
     """
-    hand, by_reading = hand_ranking(name, config), {each: outcomes(train, each) for each in get_args(Reading)}
-    methods = variants_of(name, list(by_reading[reading]))
-    rankings = {text: method.ranking(hand) for text, method in methods.items()}
-    variants = choose(by_reading, reading, list(methods), name)
+    baseline, by_reading = (
+        baseline_ranking(name, config),
+        {each: collect_outcomes(train, each) for each in get_args(Reading)},
+    )
+    methods = find_variants(name, list(by_reading[reading]))
+    rankings = {text: method.ranking(baseline) for text, method in methods.items()}
+    variants = select_variant(by_reading, reading, list(methods), name)
     thresholds = _thresholds(rankings, rankings[variants.chosen], train, reading)
-    held = {key: threshold.value for key, threshold in thresholds.items() if threshold and threshold.holds}
+    held = {key: threshold.value for key, threshold in thresholds.items() if threshold and threshold.is_significant}
     plain = replace(rankings[variants.chosen], **held)
     proposed = [plain] if head is None else [plain, replace(plain, head=head)]
     logged = {ranking: text for text, ranking in rankings.items()}
     proposals = tuple(
-        Proposal(ranking=ranking, method=logged.get(ranking) or _filed(name, ranking, config, folder), tallies={})
+        Proposal(ranking=ranking, method=logged.get(ranking) or _filed(name, ranking, config, folder), results={})
         for ranking in proposed
-        if ranking != hand
+        if ranking != baseline
     )
-    return Draft(hand=hand, variants=variants, rankings=rankings, thresholds=thresholds, proposals=proposals)
+    return Draft(baseline=baseline, variants=variants, rankings=rankings, thresholds=thresholds, proposals=proposals)
 
 
 def _filed(name: str, ranking: Ranking, config: RuntimeConfig, folder: Path) -> str:
     """Write `ranking` as a scoring file of its own, named by its content; return the method that ranks by it."""
-    both = {family: hand_ranking(family, config) for family in FAMILIES} | {name: ranking}
+    both = {family: baseline_ranking(family, config) for family in FAMILIES} | {name: ranking}
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{name}-{hashlib.sha256(repr(ranking).encode()).hexdigest()[:12]}.yaml"
     save_scoring(Scoring(mvb=both["mvb"], full=both["full"], tuned=(name,), evidence={"proposal": True}), path)
@@ -101,14 +104,14 @@ def _thresholds(
         for text, ranking in rankings.items()
         if (ranking.box_method, ranking.k_faces) == (best.box_method, best.k_faces)
     }
-    known = list(known_grasps((row for row in train if row["method"] in alike), reading))
-    worked = np.array([right for *_, right in known], dtype=bool)
-    poses = np.array([pose_of(row) for row, *_ in known], dtype=str)
+    known = list(labelled_grasps((row for row in train if row["method"] in alike), reading))
+    success = np.array([right for *_, right in known], dtype=bool)
+    poses = np.array([scenario_pose(row) for row, *_ in known], dtype=str)
     columns = {
         "min_alignment": {"first": "first_box_alignment", "grasp": "alignment"},
         "min_score": {"first": "first_generator", "grasp": "generator_score"},
     }
     return {
-        key: fit_threshold(np.array([row[column[which]] for row, which, _ in known], dtype=float), worked, poses)
+        key: fit_threshold(np.array([row[column[which]] for row, which, _ in known], dtype=float), success, poses)
         for key, column in columns.items()
     }

@@ -12,7 +12,7 @@ from sim_twin.benchmark.tuning.fit import Family, Tuning
 from sim_twin.benchmark.tuning.head import HeadReport, Skill
 from sim_twin.benchmark.tuning.svg import Point, rate_curves
 from sim_twin.benchmark.tuning.thresholds import Threshold
-from sim_twin.benchmark.tuning.variants import said
+from sim_twin.benchmark.tuning.variants import format_ranking
 from z1_runtime.grasping.features import FEATURES
 
 _STYLE = """:root{color-scheme:light}body{font:15px/1.55 system-ui,sans-serif;max-width:64rem;margin:0 auto;
@@ -46,51 +46,58 @@ def write_tuning_report(tuning: Tuning, path: Path) -> None:
     partial.replace(path)
 
 
-def held_out_lines(family: Family) -> list[list[str]]:
+def held_out_rows(family: Family) -> list[list[str]]:
     """Return a line for each proposal and reading: what, reading, successes, the hand-set values', p, and whether it
     won."""
     return [
         [
-            said(proposal.ranking),
+            format_ranking(proposal.ranking),
             reading,
             f"{tally.tuned} of {tally.scenarios}",
-            f"{tally.hand} of {tally.scenarios}",
+            f"{tally.baseline} of {tally.scenarios}",
             f"{tally.test.p:.2g}",
             "taken" if proposal.ranking == family.kept else "won" if proposal.wins else "not kept",
         ]
         for proposal in family.proposals
-        for reading, tally in proposal.tallies.items()
+        for reading, tally in proposal.results.items()
     ]
 
 
-HELD_OUT_HEAD = ("proposal", "reading", "successes", "set by hand", "McNemar p", "")
+HELD_OUT_HEADER = ("proposal", "reading", "successes", "set by hand", "McNemar p", "")
 
 
-def threshold_line(key: str, threshold: Threshold | None) -> list[str]:
+def threshold_row(key: str, threshold: Threshold | None) -> list[str]:
     """Return a cut in words: which, where, success below and above it out of its own fold, p, and what it led to."""
     if threshold is None:
         return [key, "–", "–", "–", "–", "no cut with more failures below it"]
     (low, n_low), (high, n_high) = threshold.below, threshold.above
-    verdict = "proposed" if threshold.holds else "does not hold out of its own fold"
-    return [key, f"{threshold.value:.4g}", f"{low} of {n_low}", f"{high} of {n_high}", f"{threshold.p:.2g}", verdict]
+    describe_verdict = "proposed" if threshold.is_significant else "does not hold out of its own fold"
+    return [
+        key,
+        f"{threshold.value:.4g}",
+        f"{low} of {n_low}",
+        f"{high} of {n_high}",
+        f"{threshold.p:.2g}",
+        describe_verdict,
+    ]
 
 
-THRESHOLD_HEAD = ("threshold", "value", "worked below", "worked above", "Fisher p", "")
+THRESHOLD_HEADER = ("threshold", "value", "worked below", "worked above", "Fisher p", "")
 
 
-def skill_line(name: str, skill: Skill) -> list[str]:
+def skill_row(name: str, skill: Skill) -> list[str]:
     """Return what a head knows of grasps that it was not fitted to."""
     return [
         name,
-        f"{skill.worked} of {skill.grasps}",
+        f"{skill.success} of {skill.grasps}",
         f"{skill.auc:.3f}",
         f"{skill.log_loss:.3f}",
-        f"{skill.log_loss_of_rate:.3f}",
+        f"{skill.log_loss_of_base_rate:.3f}",
         f"{skill.brier:.3f}",
     ]
 
 
-SKILL_HEAD = ("judged on", "worked", "AUC", "log loss", "log loss of the mere share", "Brier")
+SKILL_HEADER = ("judged on", "success", "AUC", "log loss", "log loss of the mere share", "Brier")
 
 
 def _list(numbers: Sequence[int]) -> str:
@@ -107,13 +114,13 @@ def _family(name: str, family: Family, reading: str) -> str:
     lines = [
         [
             text,
-            said(draft.rankings[text]),
+            format_ranking(draft.rankings[text]),
             *(f"{own[text]} of {variants.scenarios}" for own in variants.successes.values()),
         ]
         for text in variants.names
     ]
     folds = ", ".join(dict.fromkeys(variants.by_fold)) or "none"
-    held = held_out_lines(family)
+    held = held_out_rows(family)
     return "\n".join(
         [
             f"<h2>{name}</h2>",
@@ -122,8 +129,8 @@ def _family(name: str, family: Family, reading: str) -> str:
             f"<p><small>On the seeds fitted to. Best: {escape(variants.chosen)}; best of a part of the scenarios: "
             f"{escape(folds)}. Choosing so and judging on the other scenarios gives {variants.cross_validated} of "
             f"{variants.scenarios} ({reading}), the hand-set values {variants.successes[reading][name]}.</small></p>",
-            table(THRESHOLD_HEAD, [threshold_line(key, cut) for key, cut in draft.thresholds.items()]),
-            table(HELD_OUT_HEAD, held) if held else "<p>Nothing was judged on held-out seeds.</p>",
+            table(THRESHOLD_HEADER, [threshold_row(key, cut) for key, cut in draft.thresholds.items()]),
+            table(HELD_OUT_HEADER, held) if held else "<p>Nothing was judged on held-out seeds.</p>",
         ]
     )
 
@@ -135,8 +142,8 @@ def _curves(family: Family, reading: str) -> str:
     for text in draft.variants.names:
         ranking = draft.rankings[text]
         if ranking.head is None and (ranking.min_alignment, ranking.min_score) == (
-            draft.hand.min_alignment,
-            draft.hand.min_score,
+            draft.baseline.min_alignment,
+            draft.baseline.min_score,
         ):
             rest = "" if ranking.hard_filter else ", no hard filter"
             name = f"k = {ranking.k_faces}, {ranking.box_method}{rest}"
@@ -151,15 +158,20 @@ def _head(report: HeadReport) -> str:
     head = report.head
     weights: Mapping[str, float] = dict(zip(head.features, head.coefficients, strict=True))
     lines = [
-        [name, meaning, f"{weights[name]:+.2f}" if name in weights else "does not vary", f"{report.alone[name]:.3f}"]
+        [
+            name,
+            meaning,
+            f"{weights[name]:+.2f}" if name in weights else "does not vary",
+            f"{report.single_feature_auc[name]:.3f}",
+        ]
         for name, meaning in FEATURES.items()
     ]
     caption = "Share that worked against the probability told, of grasps in scenarios that were not fitted to."
-    skills = [skill_line("other scenarios", report.skill)]
-    skills += [skill_line(f"{name}, fitted to the others", skill) for name, skill in report.objects.items()]
+    skills = [skill_row("other scenarios", report.skill)]
+    skills += [skill_row(f"{name}, fitted to the others", skill) for name, skill in report.objects.items()]
     return "\n".join(
         [
-            table(SKILL_HEAD, skills),
+            table(SKILL_HEADER, skills),
             rate_curves({"head": list(report.bins)}, "probability told", caption, diagonal=True),
             table(["feature", "meaning", "weight of one deviation", "AUC alone"], lines),
         ]

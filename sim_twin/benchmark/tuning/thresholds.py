@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import fisher_exact
 
-from sim_twin.benchmark.tuning.folds import folds_of
+from sim_twin.benchmark.tuning.folds import make_folds
 
-LEAST = 5
+MIN_GRASPS_PER_SIDE = 5
 """Fewest grasps below a cut."""
-P_MOST = 0.05
+MAX_P = 0.05
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -28,29 +28,29 @@ class Threshold:
     """Fisher's exact test, one-sided, of those."""
 
     @property
-    def holds(self) -> bool:
+    def is_significant(self) -> bool:
         """Return whether it is believed."""
-        return self.p < P_MOST
+        return self.p < MAX_P
 
 
-def fit_threshold(values: np.ndarray, worked: np.ndarray, poses: np.ndarray) -> Threshold | None:
-    """Return the cut that parts failures best from successes; None where none leaves `LEAST` grasps on both sides.
+def fit_threshold(values: np.ndarray, success: np.ndarray, poses: np.ndarray) -> Threshold | None:
+    """Return the cut that parts failures best from successes; None where none leaves `MIN_GRASPS_PER_SIDE` grasps on both sides.
 
     Args:
         values: (N,) of each grasp; NaN ones are left out.
-        worked: (N,) bool.
+        success: (N,) bool.
         poses: (N,) the scenarios without their seeds, by which it is cross-validated.
     """
     known = np.isfinite(values)
-    values, worked, poses = values[known], worked[known], poses[known]
-    value = _best_cut(values, worked)
+    values, success, poses = values[known], success[known], poses[known]
+    value = _best_cut(values, success)
     if value is None:
         return None
     tally = np.zeros((2, 2), dtype=int)  # below, above; failed, worked
-    for train, test in folds_of(poses):
-        cut = _best_cut(values[train], worked[train])
+    for train, test in make_folds(poses):
+        cut = _best_cut(values[train], success[train])
         if cut is not None:
-            np.add.at(tally, ((values[test] >= cut).astype(int), worked[test].astype(int)), 1)
+            np.add.at(tally, ((values[test] >= cut).astype(int), success[test].astype(int)), 1)
     return Threshold(
         value=value,
         below=(int(tally[0, 1]), int(tally[0].sum())),
@@ -59,14 +59,14 @@ def fit_threshold(values: np.ndarray, worked: np.ndarray, poses: np.ndarray) -> 
     )
 
 
-def _best_cut(values: np.ndarray, worked: np.ndarray) -> float | None:
+def _best_cut(values: np.ndarray, success: np.ndarray) -> float | None:
     """Return the midpoint between two values that gives the labels the greatest likelihood, failures below."""
     order = np.argsort(values, kind="stable")
-    values, labels = values[order], worked[order].astype(float)
+    values, labels = values[order], success[order].astype(float)
     n, right = len(values), float(labels.sum())
     below = np.arange(1, n)
     right_below = np.cumsum(labels)[:-1]
-    allowed = (below >= LEAST) & (n - below >= LEAST) & (np.diff(values) > 1e-9)
+    allowed = (below >= MIN_GRASPS_PER_SIDE) & (n - below >= MIN_GRASPS_PER_SIDE) & (np.diff(values) > 1e-9)
     allowed &= right_below / below < (right - right_below) / np.maximum(n - below, 1)
     if not allowed.any():
         return None

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from sim_twin.benchmark.episodes.methods import Method, parse_method
-from sim_twin.benchmark.tuning.folds import folds_of
-from sim_twin.benchmark.tuning.rows import Outcomes, Reading
+from sim_twin.benchmark.tuning.folds import make_folds
+from sim_twin.benchmark.tuning.logged_episodes import Outcomes, Reading
 from z1_runtime.grasping.ranking import Ranking
 
 
@@ -29,8 +29,8 @@ class Variants:
     """Successes of those on the part that they were not chosen on: what choosing so is worth on new scenarios."""
 
 
-def variants_of(family: str, names: Sequence[str]) -> dict[str, Method]:
-    """Return those of `names` that are variants of `family` and that a scoring can express, the hand-set one first.
+def find_variants(family: str, names: Sequence[str]) -> dict[str, Method]:
+    """Return those of `names` that are variants of `family` and that a scoring can express, the baseline-set one first.
 
     Raises:
         ScoringError: a variant's scoring file is not there any more.
@@ -40,27 +40,29 @@ def variants_of(family: str, names: Sequence[str]) -> dict[str, Method]:
     return {name: method for name, method in methods.items() if method.collision_filter}
 
 
-def choose(by_reading: Mapping[str, Outcomes], reading: Reading, names: Sequence[str], hand: str) -> Variants:
+def select_variant(
+    by_reading: Mapping[str, Outcomes], reading: Reading, names: Sequence[str], baseline: str
+) -> Variants:
     """Return the variant with the most successes; of equals the one set by hand, or else the first.
 
     Args:
         by_reading: outcomes of all variants, on the training scenarios.
         reading: in which they are compared.
-        names: the variants, with `hand` among them.
-        hand: the one whose numbers are set by hand.
+        names: the variants, with `baseline` among them.
+        baseline: the one whose numbers are set by hand.
     """
-    outcomes = by_reading[reading]
-    shared = sorted(set.intersection(*(set(outcomes[name]) for name in names)))
+    collect_outcomes = by_reading[reading]
+    shared = sorted(set.intersection(*(set(collect_outcomes[name]) for name in names)))
     poses = [scenario.rpartition("-s")[0] for scenario in shared]
-    names = [hand, *(name for name in names if name != hand)]
+    names = [baseline, *(name for name in names if name != baseline)]
 
     def best(scenarios: Sequence[str]) -> str:
-        return max(names, key=lambda name: sum(outcomes[name][scenario] for scenario in scenarios))
+        return max(names, key=lambda name: sum(collect_outcomes[name][scenario] for scenario in scenarios))
 
     by_fold, right = [], 0
-    for train, test in folds_of(poses):
+    for train, test in make_folds(poses):
         by_fold.append(best([shared[n] for n in train]))
-        right += sum(outcomes[by_fold[-1]][shared[n]] for n in test)
+        right += sum(collect_outcomes[by_fold[-1]][shared[n]] for n in test)
     return Variants(
         names=tuple(names),
         successes={
@@ -74,7 +76,7 @@ def choose(by_reading: Mapping[str, Outcomes], reading: Reading, names: Sequence
     )
 
 
-def said(ranking: Ranking) -> str:
+def format_ranking(ranking: Ranking) -> str:
     """Return the numbers of `ranking` in one line."""
     words = f"k={ranking.k_faces} α={ranking.alpha:g} box={ranking.box_method}"
     words += "" if ranking.hard_filter else " no hard filter"

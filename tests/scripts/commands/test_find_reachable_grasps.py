@@ -5,7 +5,7 @@ import pytest
 
 from scripts.commands import find_reachable_grasps
 from scripts.commands.find_reachable_grasps import Config, main
-from sim_twin.benchmark.episodes.trial import Mode, Outcome, Robot
+from sim_twin.benchmark.episodes.execution import EpisodeRobot, Mode, Outcome
 
 
 @pytest.fixture
@@ -20,7 +20,7 @@ def searched(monkeypatch):
             yield run(task)
 
     monkeypatch.setattr(find_reachable_grasps, "run_tasks", run_tasks)
-    monkeypatch.setattr(Robot, "act", lambda *_: Outcome(mode=Mode.MISSED))
+    monkeypatch.setattr(EpisodeRobot, "execute", lambda *_: Outcome(mode=Mode.MISSED))
     return count
 
 

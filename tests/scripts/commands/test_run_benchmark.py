@@ -7,8 +7,8 @@ import trimesh
 from scripts.commands import run_benchmark
 from scripts.commands.run_benchmark import Config, main
 from sim_twin.benchmark.episodes import runner, scenarios
+from sim_twin.benchmark.episodes.execution import EpisodeRobot, Mode, Outcome
 from sim_twin.benchmark.episodes.runner import run_task
-from sim_twin.benchmark.episodes.trial import Mode, Outcome, Robot
 
 
 @pytest.fixture
@@ -17,7 +17,7 @@ def short(monkeypatch, tmp_path):
     whole = scenarios.grid
     monkeypatch.setattr(scenarios, "grid", lambda *args, **kwargs: whole(*args, **kwargs)[10:11])
     monkeypatch.setattr(runner, "run_tasks", lambda tasks, jobs: map(run_task, tasks))
-    monkeypatch.setattr(Robot, "act", lambda *_: Outcome(mode=Mode.MISSED))
+    monkeypatch.setattr(EpisodeRobot, "execute", lambda *_: Outcome(mode=Mode.MISSED))
     monkeypatch.setattr("sim_twin.benchmark.report.pictures._SIZE", (320, 180))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
 

@@ -61,13 +61,13 @@ def test_fitted_values_that_win_are_written_and_loaded_by_the_runtime(log, tmp_p
     monkeypatch.setattr(runner, "run_tasks", twin(lambda method, n: method.k == 3 or n % 3 == 0))
     out = tmp_path / "tune"
     assert main(Config(logs=(log,), out=out)) == 0
-    said = capsys.readouterr().out
-    assert "mvb: took k=3" in said
-    assert "No head was fitted" in said
+    format_ranking = capsys.readouterr().out
+    assert "mvb: took k=3" in format_ranking
+    assert "No head was fitted" in format_ranking
     scoring = load_scoring(out / "scoring.yaml")
     assert scoring.tuned == ("mvb", "full")
     assert scoring.evidence["judged_on_seeds"] == [2]
-    assert scoring.evidence["judged"]["mvb"][0]["top1"]["tuned"] == 81
+    assert scoring.evidence["evaluated"]["mvb"][0]["top1"]["tuned"] == 81
     assert ranking_of(RuntimeConfig(scoring=str(out / "scoring.yaml"))).k_faces == 3
     assert json.loads((out / "tuning.json").read_text())["verdicts"]["full"].startswith("took k=3")
     assert "<svg" in (out / "report.html").read_text()
@@ -81,8 +81,8 @@ def test_fitted_values_that_win_are_written_and_loaded_by_the_runtime(log, tmp_p
 def test_what_does_not_win_is_said_and_the_hand_set_values_are_what_is_written(log, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(runner, "run_tasks", twin(lambda method, n: n % 3 == 0))
     assert z1(["tune", str(log), "--out", str(tmp_path / "tune")]) == 0
-    said = " ".join(capsys.readouterr().out.split())
-    assert "mvb: kept the hand-set values (k=2 α=0.85 box=pca) because on the held-out seeds" in said
+    format_ranking = " ".join(capsys.readouterr().out.split())
+    assert "mvb: kept the hand-set values (k=2 α=0.85 box=pca) because on the held-out seeds" in format_ranking
     scoring = load_scoring(tmp_path / "tune" / "scoring.yaml")
     assert scoring.tuned == ()
     assert (scoring.mvb.k_faces, scoring.full.k_faces) == (2, 2)

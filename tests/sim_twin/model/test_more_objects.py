@@ -5,7 +5,7 @@ from sim_twin.camera.d405 import INTRINSICS
 from sim_twin.camera.render import make_renderer
 from sim_twin.model.more_objects import EXTENDED
 from sim_twin.model.objects import OBJECTS
-from sim_twin.model.parts import turned, wall
+from sim_twin.model.parts import make_homogeneous_lathe, wall
 from sim_twin.model.scene import SceneConfig
 from sim_twin.model.world import World
 
@@ -53,7 +53,7 @@ def test_it_is_as_high_as_it_says_and_its_origin_at_mid_height(world: World) -> 
 
 
 def test_a_turned_part_weighs_by_its_volume() -> None:
-    cylinder, cone = turned(((0.0, 0.03), (0.06, 0.03), (0.12, 0.0)), 0.4, _RGBA)
+    cylinder, cone = make_homogeneous_lathe(((0.0, 0.03), (0.06, 0.03), (0.12, 0.0)), 0.4, _RGBA)
     assert (cylinder.mass_kg, cone.mass_kg) == (pytest.approx(0.3), pytest.approx(0.1))
 
 

@@ -10,7 +10,7 @@ import pytest
 from hal.base import z1
 from hal.base.messages import RgbdFrame
 from hal.base.transforms import inverse, transform_points
-from sim_twin.benchmark.episodes.trial import look
+from sim_twin.benchmark.episodes.execution import capture
 from sim_twin.model.scene import SceneConfig
 from z1_runtime.config import RuntimeConfig
 from z1_runtime.factory import make_grasp_selector
@@ -22,7 +22,7 @@ SIGHT = ExtrinsicsCheck()
 
 def taken(scene: SceneConfig) -> tuple[RgbdFrame, float, np.ndarray]:
     """Return the twin's frame from home, the jaw's angle, and where its camera truly sits on the flange."""
-    frame, q = look(scene)
+    frame, q = capture(scene)
     return frame, float(q[-1]), scene.T_flange_camera()
 
 

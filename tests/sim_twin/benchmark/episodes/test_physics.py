@@ -15,15 +15,15 @@ NOISY = Scenario(object="box", distance="mid", lateral="left", pitch_deg=0.0, ph
 
 
 def test_a_scenario_always_draws_the_same_and_no_two_draw_alike():
-    drawn = [scenario.physics for scenario in grid(physics_noise=True)]
-    assert drawn == [scenario.physics for scenario in grid(physics_noise=True)]
-    assert len(set(drawn)) == 81
+    sample = [scenario.physics for scenario in grid(physics_noise=True)]
+    assert sample == [scenario.physics for scenario in grid(physics_noise=True)]
+    assert len(set(sample)) == 81
 
 
 def test_what_is_drawn_fills_its_range():
-    drawn = [Physics.drawn(seed) for seed in range(300)]
+    sample = [Physics.sample(seed) for seed in range(300)]
     for name, low, high in (("friction_factor", 0.7, 1.3), ("mass_factor", 0.7, 1.3), ("arm_latency_s", 0.0, 0.02)):
-        values = np.array([getattr(physics, name) for physics in drawn])
+        values = np.array([getattr(physics, name) for physics in sample])
         assert low <= values.min() < low + 0.1 * (high - low)
         assert high - 0.1 * (high - low) < values.max() <= high
 

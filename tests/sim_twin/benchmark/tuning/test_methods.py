@@ -7,7 +7,7 @@ import pytest
 
 from hal.base import z1
 from sim_twin.benchmark.episodes.methods import METHODS, file_name, parse_method
-from sim_twin.benchmark.episodes.seen import SharedObservation
+from sim_twin.benchmark.episodes.shared_observation import SharedObservation
 from sim_twin.benchmark.results.store import Store
 from z1_runtime.config import RuntimeConfig
 from z1_runtime.factory import make_grasp_selector

@@ -49,13 +49,13 @@ EXACT_PLANNER = PlannerConfig(
 """The planner's numbers without what they allow for noise, unseen sides and the camera's calibration."""
 
 _SPACING_M = 0.002
-_ALIKE_RAD, _ALIKE_M = 0.5, 0.03
+_SIMILAR_RAD, _SIMILAR_M = 0.5, 0.03
 """Ways that differ by this much in direction, or in place, are alike by 0.6."""
-_A_COPY = 0.95
+_DUPLICATE_SIMILARITY = 0.95
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Option:
+class ReachableGrasp:
     """One grasp, one flip, that the arm can go."""
 
     way: GripperPlacement
@@ -64,7 +64,7 @@ class Option:
     """Mover angle at which it is touched [rad]."""
 
 
-class Options:
+class GraspQueue:
     """Ways of one scene; hands out the best of those least like what failed.
 
     Args:
@@ -76,51 +76,57 @@ class Options:
     """
 
     def __init__(
-        self, options: list[Option], worth: np.ndarray, *, n_candidates: int, n_clear: int, rejected: Counter[str]
+        self,
+        find_grasps: list[ReachableGrasp],
+        value: np.ndarray,
+        *,
+        n_candidates: int,
+        n_clear: int,
+        rejected: Counter[str],
     ) -> None:
-        self._options, self._worth = options, worth
+        self._grasps, self._value = find_grasps, value
         self.n_candidates, self.n_clear, self.rejected = n_candidates, n_clear, rejected
-        self._traits = np.array([_traits(option.way) for option in options]).reshape(-1, 9)
-        self._hope, self._nearest = np.ones(len(options)), np.zeros(len(options))
+        self._descriptor = np.array([_descriptor(option.way) for option in find_grasps]).reshape(-1, 9)
+        self._novelty, self._nearest = np.ones(len(find_grasps)), np.zeros(len(find_grasps))
         self._failed: list[np.ndarray] = []
 
     def __len__(self) -> int:
-        return len(self._options)
+        return len(self._grasps)
 
-    def next(self) -> Option | None:
+    def next(self) -> ReachableGrasp | None:
         """Return the one to try next, or None when all that is left are copies of what failed."""
-        value = np.where(self._nearest < _A_COPY, self._worth + self._hope, -np.inf)
+        value = np.where(self._nearest < _DUPLICATE_SIMILARITY, self._value + self._novelty, -np.inf)
         if not len(value) or not np.isfinite(value.max()):
             return None
-        return self._options[int(value.argmax())]
+        return self._grasps[int(value.argmax())]
 
-    def fail(self, option: Option) -> None:
+    def add_failure(self, option: ReachableGrasp) -> None:
         """Set back `option` and all that is like it."""
-        self._mark(_traits(option.way))
+        self._add_failure(_descriptor(option.way))
 
-    def joined(self, others: Options) -> Options:
+    def with_failures(self, others: GraspQueue) -> GraspQueue:
         """Return `others` with the failures known here."""
         for traits in self._failed:
-            others._mark(traits)
+            others._add_failure(traits)
         return others
 
-    def _mark(self, traits: np.ndarray) -> None:
+    def _add_failure(self, traits: np.ndarray) -> None:
         self._failed.append(traits)
-        apart = self._traits - traits
-        turned = np.sum(apart[:, :6] ** 2, axis=1) / _ALIKE_RAD**2
-        moved = np.sum(apart[:, 6:] ** 2, axis=1) / _ALIKE_M**2
-        alike = np.exp(-0.5 * (turned + moved))
-        self._nearest = np.maximum(self._nearest, alike)
-        self._hope *= 1.0 - alike
+        difference = self._descriptor - traits
+        turned = np.sum(difference[:, :6] ** 2, axis=1) / _SIMILAR_RAD**2
+        moved = np.sum(difference[:, 6:] ** 2, axis=1) / _SIMILAR_M**2
+        similarity = np.exp(-0.5 * (turned + moved))
+        self._nearest = np.maximum(self._nearest, similarity)
+        self._novelty *= 1.0 - similarity
 
 
-def _traits(way: GripperPlacement) -> np.ndarray:
+def _descriptor(way: GripperPlacement) -> np.ndarray:
     """Return what makes a way another: approach, the jaws' axis, and where the pads press (9,)."""
     T = way.T_base_grasp
     return np.concatenate([T[:3, 2], way.T_base_pivot[:3, 1], T[:3, 3]])
 
 
-class TrueScene:
+class GroundTruthScene:
     """What stands in a scene, as the planner's checks want it: whole surfaces in the base frame, without noise.
 
     Args:
@@ -149,7 +155,7 @@ class TrueScene:
             timer=lambda _: nullcontext(),
         )
 
-    def options(self, sweep: SweepConfig) -> Options:
+    def find_grasps(self, sweep: SweepConfig) -> GraspQueue:
         """Return the ways that hit nothing and that the arm can go, of the grasps of `sweep`."""
         planner = self._planner
         grasps = sweep_grasps(self._surface, self._T_base_object, planner.beak.contact_depth_m, sweep)
@@ -174,20 +180,22 @@ class TrueScene:
             rejected["ik"] += not gone
             for way, ease in gone:
                 found.append(
-                    Option(way=way, width_m=float(candidates.widths_m[rank]), jaw_contact=candidates.jaw_contact(rank))
+                    ReachableGrasp(
+                        way=way, width_m=float(candidates.widths_m[rank]), jaw_contact=candidates.jaw_contact(rank)
+                    )
                 )
                 ranks.append(rank)
                 eases.append(ease)
-        worth = ranking.quality(self._middle, grasps.scores, np.zeros(len(grasps)))
-        return Options(
+        value = ranking.quality(self._middle, grasps.scores, np.zeros(len(grasps)))
+        return GraspQueue(
             found,
-            worth[np.array(ranks, dtype=int)] + planner.ability.ease * np.array(eases),
+            value[np.array(ranks, dtype=int)] + planner.ability.ease * np.array(eases),
             n_candidates=len(grasps),
             n_clear=n_clear,
             rejected=rejected,
         )
 
-    def plan(self, option: Option) -> GraspPlan:
+    def plan(self, option: ReachableGrasp) -> GraspPlan:
         """Return the whole motion of `option`.
 
         Raises:
@@ -211,7 +219,7 @@ class TrueScene:
     def _observation(self, scene: SceneConfig) -> Observation:
         """Return the scene as if it had been seen from all sides at once; its camera frame is the base frame."""
         others = [
-            transform_points(neighbour.T_base_object(), _even_points(Surface(OBJECTS[neighbour.object])))
+            transform_points(neighbour.T_base_object(), _sample_evenly(Surface(OBJECTS[neighbour.object])))
             for neighbour in scene.neighbours
         ]
         nothing = RgbdFrame(
@@ -225,13 +233,13 @@ class TrueScene:
             frame=nothing,
             T_base_camera=np.eye(4),
             detection=Detection(label=scene.object, confidence=1.0, box_px=(0, 0, 1, 1)),
-            object_points=transform_points(self._T_base_object, _even_points(self._surface)),
+            object_points=transform_points(self._T_base_object, _sample_evenly(self._surface)),
             scene_points=np.concatenate([np.zeros((0, 3)), *others]),
             table=Plane(normal=np.array([0.0, 0.0, 1.0]), offset_m=0.0),
         )
 
 
-def _even_points(surface: Surface) -> np.ndarray:
+def _sample_evenly(surface: Surface) -> np.ndarray:
     """Return points (N, 3) about 2 mm apart all over `surface`, in its own frame [m]."""
     points = surface.sample(0.5 * _SPACING_M).points
     _, first = np.unique(np.floor(points / _SPACING_M).astype(int), axis=0, return_index=True)

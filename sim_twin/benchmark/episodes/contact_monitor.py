@@ -15,7 +15,7 @@ KNOCKED_M, KNOCKED_RAD = 0.015, np.radians(15.0)
 _EVERY_TICKS = 5
 
 
-class Watch:
+class ContactMonitor:
     """Looks at the world every 10 ms; to be called every control period."""
 
     def __init__(self, world: World) -> None:
@@ -52,7 +52,7 @@ class Watch:
             return
         pose = self._world.T_base_object()
         self.lifted_m.append(self._world.lifted_m())
-        moved_m, turned_rad = _way(self._start, pose)
+        moved_m, turned_rad = _displacement(self._start, pose)
         self.displacement_m, self.tilt_rad = max(self.displacement_m, moved_m), max(self.tilt_rad, turned_rad)
         self.table_force_n = max(self.table_force_n, self._force_on_table())
 
@@ -60,14 +60,15 @@ class Watch:
         """Forget the heights seen so far."""
         self.lifted_m.clear()
 
-    def T_hand_object(self) -> np.ndarray:
+    def T_gripper_object(self) -> np.ndarray:
         """Return the object's pose (4, 4) in the frame of the fixed jaw."""
         return np.linalg.inv(self._pose(self._stator)) @ self._world.T_base_object()
 
     def neighbours_knocked(self) -> int:
         """Return how many neighbours stand no more as they did when the episode began."""
         ways = [
-            _way(start, self._pose(body)) for start, body in zip(self._neighbours_start, self._neighbours, strict=True)
+            _displacement(start, self._pose(body))
+            for start, body in zip(self._neighbours_start, self._neighbours, strict=True)
         ]
         return sum(bool(moved_m > KNOCKED_M or turned_rad > KNOCKED_RAD) for moved_m, turned_rad in ways)
 
@@ -97,7 +98,7 @@ class Watch:
         return most
 
 
-def _way(start: np.ndarray, now: np.ndarray) -> tuple[float, float]:
+def _displacement(start: np.ndarray, now: np.ndarray) -> tuple[float, float]:
     """Return how far [m] the origin moved and how far [rad] the z axis turned between two poses (4, 4)."""
     turned_rad = float(np.arccos(np.clip(now[:3, 2] @ start[:3, 2], -1.0, 1.0)))
     return float(np.linalg.norm(now[:3, 3] - start[:3, 3])), turned_rad

@@ -19,7 +19,7 @@ from z1_runtime.config import RuntimeConfig, config_from
 from z1_runtime.grasping.features import FEATURES
 
 Reading = Literal["top1", "fallthrough"]
-"""`top1`: the first-ranked grasp counts alone; `fallthrough`: the first that the arm can do is executed."""
+"""`top1`: the first-ranked grasp counts single_feature_auc; `fallthrough`: the first that the arm can do is executed."""
 Outcomes = dict[str, dict[str, bool]]
 """By method and scenario, whether it succeeded."""
 
@@ -45,7 +45,7 @@ class Logs:
         return tuple(sorted({row["seed"] for row in self.rows}))
 
 
-def read_logs(folders: Sequence[Path]) -> Logs:
+def load_logs(folders: Sequence[Path]) -> Logs:
     """Return the rows of benchmark runs, each scenario and method once.
 
     Args:
@@ -92,12 +92,12 @@ def _rows(folder: Path) -> list[Row]:
     return pa.concat_tables([pq.read_table(path) for path in paths], promote_options="permissive").to_pylist()
 
 
-def pose_of(row: Mapping[str, Any]) -> str:
+def scenario_pose(row: Mapping[str, Any]) -> str:
     """Return the scenario of a row without its seed: what may not stand on both sides of a cross-validation."""
     return row["scenario"].rpartition("-s")[0]
 
 
-def worked(row: Mapping[str, Any], reading: Reading) -> bool:
+def success(row: Mapping[str, Any], reading: Reading) -> bool:
     """Return whether the first attempt of an episode succeeded."""
     if reading == "top1":
         return bool(row["success_top1"])
@@ -105,11 +105,11 @@ def worked(row: Mapping[str, Any], reading: Reading) -> bool:
     return bool(after[0]) if after else bool(row["success"])
 
 
-def outcomes(rows: Iterable[Row], reading: Reading) -> Outcomes:
+def collect_outcomes(rows: Iterable[Row], reading: Reading) -> Outcomes:
     """Return who succeeded where."""
     by_method: Outcomes = {}
     for row in rows:
-        by_method.setdefault(row["method"], {})[row["scenario"]] = worked(row, reading)
+        by_method.setdefault(row["method"], {})[row["scenario"]] = success(row, reading)
     return by_method
 
 
@@ -117,9 +117,9 @@ def outcomes(rows: Iterable[Row], reading: Reading) -> Outcomes:
 class Samples:
     """N grasps whose outcome is known, none twice."""
 
-    measured: np.ndarray
+    features: np.ndarray
     """(N, 11) as `z1_runtime.grasping.features.measure` returns it."""
-    worked: np.ndarray
+    success: np.ndarray
     """(N,) bool."""
     poses: np.ndarray
     """(N,) the scenarios without their seeds."""
@@ -127,12 +127,12 @@ class Samples:
     """(N,) names."""
 
     def __len__(self) -> int:
-        return len(self.worked)
+        return len(self.success)
 
     def __getitem__(self, index: np.ndarray) -> Samples:
         return Samples(
-            measured=self.measured[index],
-            worked=self.worked[index],
+            features=self.features[index],
+            success=self.success[index],
             poses=self.poses[index],
             objects=self.objects[index],
         )
@@ -142,7 +142,7 @@ Which = Literal["first", "grasp"]
 """The first-ranked grasp of an episode, or the executed one; a row's columns begin so."""
 
 
-def known_grasps(rows: Iterable[Row], reading: Reading) -> Iterator[tuple[Row, Which, bool]]:
+def labelled_grasps(rows: Iterable[Row], reading: Reading) -> Iterator[tuple[Row, Which, bool]]:
     """Yield each grasp whose outcome is known: its row, which of the row's grasps it is, and whether it worked.
 
     An executed grasp worked if its episode did. Under `top1` a first-ranked grasp that was passed over, since the arm
@@ -162,15 +162,15 @@ def known_grasps(rows: Iterable[Row], reading: Reading) -> Iterator[tuple[Row, W
             yield row, "grasp", bool(row["success"])
 
 
-def samples_of(rows: Iterable[Row], reading: Reading) -> Samples:
-    """Return the known grasps of `rows` with what was measured of them; rows of earlier versions have no such columns
+def extract_samples(rows: Iterable[Row], reading: Reading) -> Samples:
+    """Return the known grasps of `rows` with what was features of them; rows of earlier versions have no such columns
     and are passed over."""
-    known = [(row, _features(row, which), right) for row, which, right in known_grasps(rows, reading)]
-    known = [(row, measured, right) for row, measured, right in known if measured is not None]
+    known = [(row, _features(row, which), right) for row, which, right in labelled_grasps(rows, reading)]
+    known = [(row, features, right) for row, features, right in known if features is not None]
     return Samples(
-        measured=np.array([measured for _, measured, _ in known], dtype=float).reshape(-1, len(FEATURES)),
-        worked=np.array([right for *_, right in known], dtype=bool),
-        poses=np.array([pose_of(row) for row, *_ in known], dtype=str),
+        features=np.array([features for _, features, _ in known], dtype=float).reshape(-1, len(FEATURES)),
+        success=np.array([right for *_, right in known], dtype=bool),
+        poses=np.array([scenario_pose(row) for row, *_ in known], dtype=str),
         objects=np.array([row["object"] for row, *_ in known], dtype=str),
     )
 

@@ -15,7 +15,7 @@ from hal.base.messages import RgbdFrame
 from hal.servo.guard import Guard
 from hal.servo.servo import Servo
 from sim_twin.backends import make_rig
-from sim_twin.benchmark.episodes.watch import KNOCKED_M, KNOCKED_RAD, Watch
+from sim_twin.benchmark.episodes.contact_monitor import KNOCKED_M, KNOCKED_RAD, ContactMonitor
 from sim_twin.model.scene import SceneConfig
 from sim_twin.model.world import World
 from z1_runtime.geometry.kinematics import Kinematics
@@ -23,9 +23,9 @@ from z1_runtime.motion.executor import Executor, MotionError
 from z1_runtime.motion.trajectory import MotionLimits, PathFailure, hold, joint_move, straight_move
 from z1_runtime.types import GraspPlan, JointTrajectory
 
-UP_M, SLIP_M, HOLD_S, ASIDE_M = 0.05, 0.02, 1.0, 0.03
+MIN_LIFT_M, MAX_SLIP_M, HOLD_S, CARRY_M = 0.05, 0.02, 1.0, 0.03
 """Success: at least 50 mm up for 1 s after a lift and a 30 mm move aside, and less than 20 mm of slip in the hand."""
-_TABLE_N = 5.0
+_MAX_TABLE_FORCE_N = 5.0
 _FRAME_TIMEOUT_S = 1.0
 
 
@@ -79,7 +79,7 @@ class Outcome:
     """A sentence, where there is more to say."""
 
 
-class Robot:
+class EpisodeRobot:
     """A lock-step arm at home in a scene of its own, with its camera and an impartial observer; use it with `with`."""
 
     def __init__(self, scene: SceneConfig, kinematics: Kinematics | None = None, speed: float = 0.5) -> None:
@@ -87,7 +87,7 @@ class Robot:
         assert rig.call_every_tick is not None
         self.world: World = rig.world
         self._rig, self._undo = rig, ExitStack()
-        self._servo, self._watch = Servo(rig.arm, rig.clock, guard=Guard()), Watch(rig.world)
+        self._servo, self._watch = Servo(rig.arm, rig.clock, guard=Guard()), ContactMonitor(rig.world)
         self._executor = Executor(self._servo, rig.clock)
         self._kinematics, self._limits = kinematics or Kinematics(), MotionLimits.at_speed(speed)
         self._sees = False
@@ -103,7 +103,7 @@ class Robot:
     def __exit__(self, *_: object) -> None:
         self._undo.close()
 
-    def look(self) -> tuple[RgbdFrame, np.ndarray]:
+    def capture(self) -> tuple[RgbdFrame, np.ndarray]:
         """Return the camera's next frame and the joints (7,) it was taken at [rad], once the arm rests."""
         if not self._sees:
             self._rig.camera.connect()
@@ -112,9 +112,9 @@ class Robot:
         state = self._executor.settle()
         return self._rig.camera.wait_for_frame(_FRAME_TIMEOUT_S), state.q
 
-    def act(self, plan: GraspPlan) -> Outcome:
+    def execute(self, plan: GraspPlan) -> Outcome:
         """Grasp, lift, carry aside and hold; say how it ended."""
-        aside = carry(self._kinematics, plan, self._limits)
+        aside = plan_carry(self._kinematics, plan, self._limits)
         if aside is None:
             return Outcome(mode=Mode.NO_PATH, detail="the lifted object cannot be moved 30 mm to any side.")
         self._watch.begin()
@@ -132,7 +132,7 @@ class Robot:
             neighbours_knocked=self._watch.neighbours_knocked(),
             duration_s=self.world.time_s - start_s,
         )
-        return outcome if outcome.mode is Mode.STOPPED else _judged(outcome)
+        return outcome if outcome.mode is Mode.STOPPED else _classify(outcome)
 
     def withdraw(self, plan: GraspPlan, outcome: Outcome, jaw_home: float) -> None:
         """Go home with open jaws after a failed attempt at `plan`; what still hangs in them is put down first.
@@ -156,7 +156,7 @@ class Robot:
         known |= {"displacement_m": watch.displacement_m, "tilt_rad": watch.tilt_rad}
         executor.execute(plan.close)
         state = executor.settle()
-        closed = watch.T_hand_object()
+        closed = watch.T_gripper_object()
         known |= {
             "jaws_touching": watch.jaws_touching(),
             "jaw": float(state.q[-1]),
@@ -167,7 +167,7 @@ class Robot:
             executor.settle()
         watch.clear()
         executor.execute(hold(aside.q[-1], HOLD_S))
-        known["slip_m"] = float(np.linalg.norm(watch.T_hand_object()[:3, 3] - closed[:3, 3]))
+        known["slip_m"] = float(np.linalg.norm(watch.T_gripper_object()[:3, 3] - closed[:3, 3]))
 
     def _move_to(self, q_goal: np.ndarray) -> None:
         """Move straight in joint space from where the arm was last told to be to `q_goal` (7,) [rad]."""
@@ -177,20 +177,20 @@ class Robot:
             self._executor.settle()
 
 
-def look(scene: SceneConfig) -> tuple[RgbdFrame, np.ndarray]:
+def capture(scene: SceneConfig) -> tuple[RgbdFrame, np.ndarray]:
     """Return the camera's frame from home and the joints (7,) it was taken at [rad]."""
-    with Robot(scene) as robot:
-        return robot.look()
+    with EpisodeRobot(scene) as robot:
+        return robot.capture()
 
 
-def carry(kinematics: Kinematics, plan: GraspPlan, limits: MotionLimits) -> JointTrajectory | None:
+def plan_carry(kinematics: Kinematics, plan: GraspPlan, limits: MotionLimits) -> JointTrajectory | None:
     """Return the 30 mm sideways move that follows the lift: towards the middle if it can be, else another way."""
     start = plan.lift.q[-1]
     T = kinematics.pivot(start[:6])
     inwards = -np.sign(T[1, 3]) or 1.0
     for aside in ((0.0, inwards), (0.0, -inwards), (-1.0, 0.0), (1.0, 0.0)):
         T_goal = T.copy()
-        T_goal[:2, 3] += ASIDE_M * np.array(aside)
+        T_goal[:2, 3] += CARRY_M * np.array(aside)
         try:
             return straight_move(kinematics, T, T_goal, start, float(start[-1]), limits)
         except PathFailure:
@@ -203,17 +203,17 @@ def _reversed(motion: JointTrajectory) -> JointTrajectory:
     return JointTrajectory(t_s=motion.t_s[-1] - motion.t_s[::-1], q=motion.q[::-1], dq=-motion.dq[::-1])
 
 
-def _judged(outcome: Outcome) -> Outcome:
+def _classify(outcome: Outcome) -> Outcome:
     """Return `outcome` with the mode that its figures give; of several causes the first in time."""
-    if outcome.lifted_m >= UP_M and outcome.slip_m < SLIP_M:
+    if outcome.lifted_m >= MIN_LIFT_M and outcome.slip_m < MAX_SLIP_M:
         return outcome
-    if outcome.table_force_n > _TABLE_N:
+    if outcome.table_force_n > _MAX_TABLE_FORCE_N:
         mode = Mode.TABLE_COLLISION
     elif outcome.displacement_m > KNOCKED_M or outcome.tilt_rad > KNOCKED_RAD:
         mode = Mode.KNOCKED
     elif outcome.jaws_touching < 2:
         mode = Mode.MISSED
-    elif outcome.lifted_m >= UP_M:
+    elif outcome.lifted_m >= MIN_LIFT_M:
         mode = Mode.SLIPPED
     else:
         mode = Mode.DROPPED
