@@ -15,7 +15,7 @@ from sim_twin.benchmark.episodes.execution import RETRIED, EpisodeRobot, Mode, O
 from sim_twin.benchmark.episodes.methods import Method, file_name
 from sim_twin.benchmark.episodes.occlusion import occlude
 from sim_twin.benchmark.episodes.recordings import Recordings, record
-from sim_twin.benchmark.episodes.rows import Attempt, Row, make_row
+from sim_twin.benchmark.episodes.rows import Attempt, Row, make_error_row, make_row
 from sim_twin.benchmark.episodes.scenarios import Scenario
 from sim_twin.benchmark.episodes.shared_observation import SharedObservation
 from z1_runtime.motion.executor import MotionError
@@ -45,14 +45,23 @@ def run_scenario(
         top_k: candidates that may be executed; after a failure the scene is looked at again, as it then is.
         recordings: which episodes are written for Rerun too.
     """
-    decider = make_grasp_selector(scenario, scenario.draw_seed)
-    seen = _observe_first(scenario, decider)
-    if isinstance(seen, Attempt):
-        return [make_row(scenario, method.name, [seen], top_k=top_k) for method in methods]
-    return [
-        _run_method(scenario, method, make_grasp_selector, seen, top_k=top_k, recordings=recordings)
-        for method in methods
-    ]
+    decider = make_grasp_selector(scenario, scenario.draw_seed)  # settings that cannot be used end the run here
+    try:
+        seen = _observe_first(scenario, decider)
+    except Exception as error:  # one scenario's defect must not cost the run the others
+        return [make_error_row(scenario, method.name, error, top_k=top_k) for method in methods]
+    rows = []
+    for method in methods:
+        try:
+            row = (
+                make_row(scenario, method.name, [seen], top_k=top_k)
+                if isinstance(seen, Attempt)
+                else _run_method(scenario, method, make_grasp_selector, seen, top_k=top_k, recordings=recordings)
+            )
+        except Exception as error:  # as above: the row keeps type, text and traceback
+            row = make_error_row(scenario, method.name, error, top_k=top_k)
+        rows.append(row)
+    return rows
 
 
 def record_scenario(scenario: Scenario, method: Method, make_grasp_selector: MakeDecider, folder: Path) -> Path | None:

@@ -44,6 +44,8 @@ class Mode(StrEnum):
     DROPPED = "dropped"
     STOPPED = "arm stopped"
     """The servo braked: a limit, a stall, or a joint that did not follow."""
+    ERROR = "error"
+    """An exception, a defect of this software, ended the episode; its row keeps the exception's type and text."""
 
 
 RETRIED = (Mode.MISSED, Mode.KNOCKED, Mode.SLIPPED, Mode.DROPPED)

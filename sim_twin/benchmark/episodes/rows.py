@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import traceback
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -23,6 +24,8 @@ from z1_runtime.types import GraspPlan, Rejection
 Row = dict[str, Any]
 """One episode: column to value, as `make_row` says. A column that does not apply is missing, in the table None."""
 
+TRACEBACK = "traceback"
+"""Key of an error row's traceback."""
 REASONS = ("width", "table", "scene", "object", "self", "ik", "path")
 """For which the planner refuses a candidate; each has a column `rejected_…`."""
 
@@ -75,7 +78,7 @@ def make_row(
     """
     first, last = attempts[0], attempts[-1]
     success = last.ended.mode is Mode.SUCCESS
-    row: Row = {**scenario.features(), "method": method, "version": _version()}
+    row: Row = {**scenario.columns(), "method": method, "version": _version()}
     row |= {"success": success, "success_top1": _is_top1(first)}
     row |= {
         "top_k": top_k,
@@ -91,6 +94,20 @@ def make_row(
     row |= {f"rejected_{reason}": reasons[reason] for reason in REASONS}
     row |= _observation_columns(last.seen) | _ranking_columns(last) | _plan_columns(last) | _feature_columns(last)
     return row if qpos is None else row | {"final_qpos": qpos.tolist()}
+
+
+def make_error_row(scenario: Scenario, method: str, error: Exception, *, top_k: int = 1) -> Row:
+    """Return the row of an episode that `error` ended: a failure that the other episodes do not share.
+
+    `error_type` and `detail` hold the exception's type and text; `TRACEBACK` is for the run's log (see
+    `sim_twin.benchmark.results.store.Store.add`) and no column of the table.
+    """
+    mode = Mode.ERROR.value
+    row: Row = {**scenario.identity(), "method": method, "version": _version()}
+    row |= {"success": False, "success_top1": False, "top_k": top_k, "attempts": 1, "modes": [mode], "ranks": [-1]}
+    row |= {"success_after": [False] * top_k, "given_up": "", "mode": mode}
+    row |= {"detail": str(error), "error_type": type(error).__name__}
+    return row | {TRACEBACK: "".join(traceback.format_exception(error))}
 
 
 def _is_top1(attempt: Attempt) -> bool:

@@ -46,7 +46,7 @@ class Scenario:
     physics_noise: bool = False
     """Whether friction, mass, the camera's mount and the arm's promptness are off what the runtime believes."""
     shape: GraspObject | None = field(default=None, repr=False)
-    """The object itself, where it is none of the named ones; its name must say all of it (see `features`)."""
+    """The object itself, where it is none of the named ones; its name must identify it (see `columns`)."""
 
     def __post_init__(self) -> None:
         if self.shape is None:
@@ -97,8 +97,8 @@ class Scenario:
         return [name for name in own_set if name != self.object]
 
     @classmethod
-    def of(cls, row: Mapping[str, Any], shapes: Mapping[str, GraspObject] | None = None) -> Scenario:
-        """Return the scenario of a table's row: what `features` gave, maybe among other columns.
+    def from_row(cls, row: Mapping[str, Any], shapes: Mapping[str, GraspObject] | None = None) -> Scenario:
+        """Return the scenario of a table's row: what `columns` gave, maybe among other columns.
 
         Args:
             row: column to value; one of an earlier version may lack what has a default.
@@ -108,11 +108,15 @@ class Scenario:
         known = {name: row[name] for name in columns if row.get(name) is not None}
         return cls(**known, shape=(shapes or {}).get(row["object"]))
 
-    def features(self) -> dict[str, object]:
-        """Return what identifies it and what was drawn for it, as columns of a table."""
+    def identity(self) -> dict[str, object]:
+        """Return the key, the fields and the sampled physics as columns of a table; `scene()` is not needed for it."""
         own = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "shape"}
+        return {"scenario": self.key, **own, **asdict(self.physics)}
+
+    def columns(self) -> dict[str, object]:
+        """Return the identity and the sampled neighbours as columns of a table."""
         neighbours = [neighbour.object for neighbour in self.scene().neighbours] if self.clutter else []
-        return {"scenario": self.key, **own, **asdict(self.physics), "neighbours": neighbours}
+        return {**self.identity(), "neighbours": neighbours}
 
 
 def grid(

@@ -83,7 +83,7 @@ def search(scenario: Scenario, config: OracleConfig) -> Row:
     search_run = _Search(scenario, config)
     for _ in search_run.run():
         pass
-    row: Row = {**scenario.features(), "method": METHOD, "version": version("z1-grasp")}
+    row: Row = {**scenario.columns(), "method": METHOD, "version": version("z1-grasp")}
     return row | search_run.report() | {"search_ms": watch.lap_ms()}
 
 

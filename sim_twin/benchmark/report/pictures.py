@@ -26,7 +26,7 @@ _SIZE, _SMALL = (960, 540), (480, 270)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Picture:
+class EpisodePicture:
     """What the report shows of one episode."""
 
     words: str
@@ -39,7 +39,7 @@ class Picture:
 
 def draw_pictures(
     rows: Sequence[Row], choice: Choice, folder: Path, shapes: Mapping[str, GraspObject] | None = None
-) -> list[tuple[Row, Picture]]:
+) -> list[tuple[Row, EpisodePicture]]:
     """Draw the final state of episodes as <scenario>-<method>.png in `folder`.
 
     Args:
@@ -59,11 +59,11 @@ def draw_pictures(
     folder.mkdir(parents=True, exist_ok=True)
     pictures = []
     for row in rows if choice == "all" else shown:
-        png = draw_picture(Scenario.of(row, shapes).scene(), np.array(row["final_qpos"]), *_SIZE)
+        png = draw_picture(Scenario.from_row(row, shapes).scene(), np.array(row["final_qpos"]), *_SIZE)
         (folder / f"{row['scenario']}-{file_name(row['method'])}.png").write_bytes(png)
         if row in shown:
             words = f"{row['scenario']}, {row['method']}: {row['mode']}"
-            pictures.append((row, Picture(words=words, jpeg=_small_jpeg(png))))
+            pictures.append((row, EpisodePicture(words=words, jpeg=_small_jpeg(png))))
     return pictures
 
 

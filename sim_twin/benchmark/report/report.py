@@ -15,7 +15,7 @@ from sim_twin.benchmark.episodes.rows import Row
 from sim_twin.benchmark.episodes.scenarios import DISTANCES_M, LATERALS_M
 from sim_twin.benchmark.report import paper, svg
 from sim_twin.benchmark.report import report_tables as tables
-from sim_twin.benchmark.report.pictures import Picture
+from sim_twin.benchmark.report.pictures import EpisodePicture
 
 _CONDITIONS = {
     "object": "Object",
@@ -46,7 +46,9 @@ pre{background:#f7fafc;padding:.8rem;white-space:pre-wrap;overflow-wrap:anywhere
 .pictures figure{width:21.5rem}.pictures img{width:100%;border-radius:6px;display:block}a{color:#2b6cb0}"""
 
 
-def write_report(rows: Sequence[Row], summary: Mapping[str, Any], path: Path, pictures: Sequence[Picture] = ()) -> None:
+def write_report(
+    rows: Sequence[Row], summary: Mapping[str, Any], path: Path, pictures: Sequence[EpisodePicture] = ()
+) -> None:
     """Write the report of a run.
 
     Args:
@@ -169,7 +171,7 @@ def _modes(methods: Mapping[str, Any]) -> str:
     return svg.share_bars(modes, "success", "Episodes by how they ended (fallthrough).")
 
 
-def _gallery(pictures: Sequence[Picture]) -> str:
+def _gallery(pictures: Sequence[EpisodePicture]) -> str:
     if not pictures:
         return ""
     figures = "".join(

@@ -16,9 +16,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from hal.base.errors import OutputExistsError
-from sim_twin.benchmark.episodes.rows import Row
+from sim_twin.benchmark.episodes.rows import TRACEBACK, Row
 
-FOLDER, TABLE = "episodes", "episodes.parquet"
+FOLDER, TABLE, ERROR_LOG = "episodes", "episodes.parquet", "errors.log"
 _LONGEST_NAME = 100
 
 
@@ -32,6 +32,7 @@ class Store:
     def __init__(self, out: Path, resume: bool) -> None:
         self._folder = out / FOLDER
         self._table = out / TABLE
+        self._errors = out / ERROR_LOG
         if not resume and any(self._folder.glob("*.parquet")):
             raise OutputExistsError(
                 f"{out} holds the episodes of an earlier run; add --resume to go on with it, or give another --out."
@@ -45,8 +46,13 @@ class Store:
         return {(row["scenario"], row["method"]) for row in self.rows([])}
 
     def add(self, rows: Iterable[Row]) -> None:
-        """Keep the rows of one scenario; on return they are on the disk."""
+        """Keep the rows of one scenario; on return they are on the disk.
+
+        Tracebacks of error rows go to `ERROR_LOG`, not into the table.
+        """
         rows = list(rows)
+        self._log_errors(rows)
+        rows = [{name: value for name, value in row.items() if name != TRACEBACK} for row in rows]
         methods = "+".join(sorted(str(row["method"]).replace(":", "_").replace("=", "") for row in rows))
         if len(methods) > _LONGEST_NAME or "/" in methods:  # many variants, or one with the path of its scoring
             methods = hashlib.sha256(methods.encode()).hexdigest()[:16]
@@ -56,6 +62,12 @@ class Store:
         with partial.open("rb") as file:
             os.fsync(file.fileno())
         partial.replace(path)
+
+    def _log_errors(self, rows: Iterable[Row]) -> None:
+        entries = [f"{row['scenario']}, {row['method']}\n{row[TRACEBACK]}\n" for row in rows if TRACEBACK in row]
+        if entries:
+            with self._errors.open("a", encoding="utf-8") as file:
+                file.writelines(entries)
 
     def rows(self, columns: list[str] | None = None) -> list[Row]:
         """Return all rows, sorted by scenario and method; columns that a row lacks are None.

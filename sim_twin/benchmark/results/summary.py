@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from sim_twin.benchmark.episodes.execution import Mode
 from sim_twin.benchmark.episodes.rows import Row
 from sim_twin.benchmark.results.stats import mcnemar, paired_difference, wilson
 
@@ -46,6 +47,7 @@ def summarise_method(rows: Sequence[Row]) -> dict[str, Any]:
         "rate_top1": top1 / n if n else float("nan"),
         "rate_top1_95": wilson(top1, n),
         "rate_after": _rates_after(rows),
+        "errors": sum(row["mode"] == Mode.ERROR.value for row in rows),
         "modes": dict(Counter(row["mode"] for row in rows).most_common()),
         "by": {column: _breakdown(rows, column) for column in CONDITIONS},
         "counts": {column: _median(rows, column) for column in _COUNTS},

@@ -126,7 +126,7 @@ def _collect_held_out(
         return held
     poses = {scenario_pose(row): row for row in train}
     try:
-        scenarios = [replace(Scenario.of(row), seed=seed) for seed in seeds for row in poses.values()]
+        scenarios = [replace(Scenario.from_row(row), seed=seed) for seed in seeds for row in poses.values()]
     except ValueError as error:
         raise TuneError(
             f"{error} Episodes with a mesh of yours cannot be run again from their rows: log the held-out seeds too, "

@@ -18,7 +18,7 @@ pytest.importorskip("sklearn", reason="uv sync --inexact --extra tune")
 
 def row(scenario, method, success):
     return {
-        **scenario.features(), "method": method, "version": "0", "attempts": 1, "rank": 0, "candidate": 1,
+        **scenario.columns(), "method": method, "version": "0", "attempts": 1, "rank": 0, "candidate": 1,
         "success": success, "success_top1": success, "alignment": 0.5, "generator_score": 0.5,
     }  # fmt: skip
 

@@ -45,7 +45,7 @@ def test_the_same_scenario_has_the_same_neighbours_and_the_row_names_them():
     assert CLUTTERED.scene() == CLUTTERED.scene()
     assert len({s.scene().neighbours for s in grid(clutters=(2,))}) == 81
     assert CLUTTERED.features()["neighbours"] == [n.object for n in CLUTTERED.scene().neighbours]
-    assert Scenario.of(CLUTTERED.features()) == CLUTTERED
+    assert Scenario.from_row(CLUTTERED.features()) == CLUTTERED
 
 
 def test_the_extended_sets_neighbours_are_of_that_set():

@@ -25,7 +25,7 @@ def test_failure_modes_take_turns_and_what_never_moved_is_left_out():
 
 def test_a_row_says_which_scenario_it_is():
     for scenario in grid(occlusions=(0.25,)):
-        assert Scenario.of(scenario.features() | {"method": "mvb"}) == scenario
+        assert Scenario.from_row(scenario.columns() | {"method": "mvb"}) == scenario
 
 
 def test_the_final_state_is_drawn_from_the_row(tmp_path, monkeypatch: pytest.MonkeyPatch):
@@ -33,7 +33,7 @@ def test_the_final_state_is_drawn_from_the_row(tmp_path, monkeypatch: pytest.Mon
     monkeypatch.setattr(pictures, "_SIZE", (240, 135))
     scenario = Scenario(object="mug", distance="mid", lateral="centre", pitch_deg=0.0)
     qpos = World(scenario.scene()).data.qpos.tolist()
-    rows = [scenario.features() | row("mvb:k=3", "missed", qpos) | {"scenario": scenario.key}]
+    rows = [scenario.columns() | row("mvb:k=3", "missed", qpos) | {"scenario": scenario.key}]
     shown = draw_pictures(rows, "failures", tmp_path / "pictures")
     (file,) = (tmp_path / "pictures").iterdir()
     assert file.name == "mug-mid-centre-+0-s0-mvb_k_3.png"

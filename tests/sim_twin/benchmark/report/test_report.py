@@ -8,7 +8,7 @@ import pytest
 
 from sim_twin.benchmark.episodes.scenarios import grid
 from sim_twin.benchmark.report import svg
-from sim_twin.benchmark.report.pictures import Picture
+from sim_twin.benchmark.report.pictures import EpisodePicture
 from sim_twin.benchmark.report.report import write_report
 from sim_twin.benchmark.results.summary import STAGES, summarise
 
@@ -23,7 +23,7 @@ def make_rows(methods, objects=("bottle", "box", "cylinder"), occlusions=(0.0,))
             success = bool(rng.random() < (k + 1) / (len(methods) + 1))
             rank = int(rng.integers(3))
             mode = "success" if success else MODES[rng.integers(len(MODES))]
-            row = {**scenario.features(), "method": method, "success": success, "mode": mode}
+            row = {**scenario.columns(), "method": method, "success": success, "mode": mode}
             row |= {"success_top1": success and rank == 0, "n_candidates": 800, "n_free": 300, "n_ranked": 120}
             row |= {"detect_ms": 20.0, "generate_ms": rng.uniform(100.0, 200.0), "rejected_ik": int(rng.integers(9))}
             rows.append(row | ({"rank": rank, "plan_ms": None} if mode != "no candidate" else {"n_free": -1}))
@@ -93,7 +93,7 @@ def test_pictures_are_in_the_page(tmp_path):
     page = write(
         tmp_path / "report.html",
         make_rows(("mvb",)),
-        pictures=[Picture(words="box: missed", jpeg=b"jpeg", recording="recordings/a b.rrd")],
+        pictures=[EpisodePicture(words="box: missed", jpeg=b"jpeg", recording="recordings/a b.rrd")],
     )
     assert f"data:image/jpeg;base64,{b64encode(b'jpeg').decode()}" in page
     assert "box: missed" in page
