@@ -1,4 +1,4 @@
-"""Judges proposals by episodes on seeds that they were not fitted to, against the values that were set by hand."""
+"""Evaluation of proposals on held-out seeds, against the values set by hand."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from sim_twin.benchmark.tuning.variants import format_ranking
 from z1_runtime.grasping.ranking import Ranking
 
 MAX_P = 0.05
-"""Least evidence that moves a value that was set by hand."""
+"""Significance level at which a proposal replaces a value set by hand."""
 MAX_LOST_RATIO = 0.02
-"""Share of the scenarios that a winner in one reading may lose in the other: one of 81 says nothing."""
+"""Ratio of the scenarios that a winner in one reading may lose in the other: one of 81 is no evidence."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -32,38 +32,38 @@ class HeldOutResult:
     test: McNemar
     """First the proposal, second the hand-set values."""
 
-    def plain(self) -> dict[str, float]:
-        """Return it as YAML and JSON hold it."""
+    def to_dict(self) -> dict[str, float]:
+        """Return the counts and p for YAML and JSON."""
         return {"scenarios": self.scenarios, "hand_set": self.baseline, "tuned": self.tuned, "p": self.test.p}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Proposal:
-    """Numbers that might be better, and how they were judged."""
+    """Proposed numbers of a ranking, and their results on the held-out seeds."""
 
     method: str
-    """By which name its episodes are logged."""
+    """Name under which its episodes are logged."""
     ranking: Ranking
     results: Mapping[str, HeldOutResult]
-    """By reading; empty while it was not judged."""
+    """By reading; empty before the evaluation."""
     wins: bool = False
 
 
 def evaluate_proposals(
     held: Sequence[Row], name: str, proposals: Sequence[Proposal], reading: Reading
 ) -> list[Proposal]:
-    """Return `proposals` with what the rows `held` say of each.
+    """Return `proposals` with their results in the rows `held`.
 
     Args:
         held: of the held-out seeds.
-        name: of the method with the baseline-set values.
-        proposals: of that method; each has its share of `MAX_P`.
+        name: of the method with the hand-set values.
+        proposals: of that method; `MAX_P` is divided among them (Bonferroni).
         reading: in which a proposal must win; in the other it may lose `MAX_LOST_RATIO`.
     """
     evaluated = []
     for proposal in proposals:
         results = {each: _compare(held, proposal.method, name, each) for each in get_args(Reading)}
-        results = {each: tally for each, tally in results.items() if tally.scenarios}
+        results = {each: result for each, result in results.items() if result.scenarios}
         wins = bool(results) and _wins(results, reading, MAX_P / len(proposals))
         evaluated.append(replace(proposal, results=results, wins=wins))
     return evaluated
@@ -85,19 +85,20 @@ def _compare(held: Sequence[Row], method: str, baseline: str, reading: Reading) 
     )
 
 
-def _wins(results: Mapping[str, HeldOutResult], reading: Reading, p_most: float) -> bool:
+def _wins(results: Mapping[str, HeldOutResult], reading: Reading, max_p: float) -> bool:
     own = results[reading]
-    no_worse = all(tally.tuned >= tally.baseline - MAX_LOST_RATIO * tally.scenarios for tally in results.values())
-    return own.tuned > own.baseline and own.test.p < p_most and no_worse
+    no_worse = all(result.tuned >= result.baseline - MAX_LOST_RATIO * result.scenarios for result in results.values())
+    return own.tuned > own.baseline and own.test.p < max_p and no_worse
 
 
 def describe_verdict(baseline: Ranking, proposals: Sequence[Proposal], best: Proposal | None, reading: Reading) -> str:
-    """Return what became of them, in a sentence."""
+    """Return the decision and its reason in a sentence."""
     if best is not None:
-        tally = best.results[reading]
+        result = best.results[reading]
         return (
-            f"took {format_ranking(best.ranking)} for {format_ranking(baseline)}: {tally.tuned} of {tally.scenarios} against {tally.baseline} on "
-            f"the held-out seeds ({reading}), McNemar p = {tally.test.p:.2g}."
+            f"took {format_ranking(best.ranking)} for {format_ranking(baseline)}: {result.tuned} of "
+            f"{result.scenarios} against {result.baseline} on the held-out seeds ({reading}), "
+            f"McNemar p = {result.test.p:.2g}."
         )
     kept = f"kept the hand-set values ({format_ranking(baseline)})"
     if not proposals:
@@ -105,17 +106,18 @@ def describe_verdict(baseline: Ranking, proposals: Sequence[Proposal], best: Pro
     if not any(proposal.results for proposal in proposals):
         return f"{kept} because no proposal was run on the held-out seeds."
     limit = MAX_P / len(proposals)
-    parts = [_lost(proposal, reading, limit) for proposal in proposals if proposal.results]
+    parts = [_describe_loss(proposal, reading, limit) for proposal in proposals if proposal.results]
     return f"{kept} because on the held-out seeds {'; '.join(parts)}."
 
 
-def _lost(proposal: Proposal, reading: Reading, limit: float) -> str:
-    tally = proposal.results[reading]
-    words = f"{format_ranking(proposal.ranking)} had {tally.tuned} of {tally.scenarios} ({reading}) against {tally.baseline}"
-    if tally.tuned <= tally.baseline:
+def _describe_loss(proposal: Proposal, reading: Reading, limit: float) -> str:
+    result = proposal.results[reading]
+    words = f"{format_ranking(proposal.ranking)} had {result.tuned} of {result.scenarios} ({reading})"
+    words += f" against {result.baseline}"
+    if result.tuned <= result.baseline:
         return words
-    words += f", McNemar p = {tally.test.p:.2g}"
-    if tally.test.p >= limit:
-        return f"{words} where below {limit:.2g} was asked for"
+    words += f", McNemar p = {result.test.p:.2g}"
+    if result.test.p >= limit:
+        return f"{words} where below {limit:.2g} was required"
     (other,) = (each for each in proposal.results if each != reading)
     return f"{words}, but {proposal.results[other].tuned} against {proposal.results[other].baseline} ({other})"

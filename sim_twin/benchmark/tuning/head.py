@@ -1,4 +1,4 @@
-"""Fits the scoring head, a logistic regression, and says what it knows of scenarios and objects it has not seen."""
+"""Fit of the scoring head, a logistic regression, and its metrics on held-out scenarios and objects."""
 
 from __future__ import annotations
 
@@ -13,30 +13,30 @@ from z1_runtime.grasping.features import FEATURES
 from z1_runtime.grasping.ranking import ScoringHead
 
 PENALTIES = (0.01, 0.1, 1.0, 10.0)
-"""Inverse strengths of the L2 penalty, of which cross-validation takes one."""
+"""Inverse strengths of the L2 penalty that cross-validation chooses from."""
 MIN_GRASPS_PER_CLASS = 10
-"""Fewest grasps that worked, and that did not."""
+"""Minimum number of successful grasps, and of failed ones."""
 _BINS = 8
-_CONSTANT = 1e-9
+_CONSTANT = 1e-9  # standard deviation below which a feature carries nothing but rounding
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Skill:
-    """How well probabilities tell what works; of grasps that they were not fitted to."""
+    """Metrics of predicted probabilities, on grasps that they were not fitted to."""
 
     grasps: int
-    success: int
+    successes: int
     auc: float
-    """Chance that one that worked was told more likely than one that did not; NaN where all ended alike."""
+    """Chance that a success was predicted more probable than a failure; NaN where all outcomes are the same."""
     log_loss: float
     log_loss_of_base_rate: float
-    """The same of whoever knows only the share that worked of the grasps fitted to."""
+    """The same of predicting the success rate of the grasps fitted to."""
     brier: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HeadReport:
-    """A head and what it is worth."""
+    """A head and its metrics."""
 
     head: ScoringHead
     """Fitted to all grasps."""
@@ -47,18 +47,18 @@ class HeadReport:
     single_feature_auc: Mapping[str, float]
     """The AUC of single features, for comparison."""
     bins: tuple[tuple[float, int, int], ...]
-    """Calibration, cross-validated: mean probability, grasps that worked, grasps; from the least likely up."""
+    """Calibration, cross-validated: mean probability, successes, grasps; by increasing probability."""
 
     @property
     def beats_base_rate(self) -> bool:
-        """Return whether it says more than the mere share of successes."""
+        """Return whether it predicts better than the success rate alone."""
         return self.skill.log_loss < self.skill.log_loss_of_base_rate
 
 
 def fit_head(samples: Samples) -> HeadReport | None:
     """Return the head fitted to `samples`; None where there are too few successes, failures or scenarios."""
-    success = int(samples.success.sum())
-    if min(success, len(samples) - success) < MIN_GRASPS_PER_CLASS or len(set(samples.poses)) < 2:
+    successes = int(samples.success.sum())
+    if min(successes, len(samples) - successes) < MIN_GRASPS_PER_CLASS or len(set(samples.poses)) < 2:
         return None
     predictions = [(test, *_predict(samples[train], samples[test])) for train, test in make_folds(samples.poses)]
     order = np.concatenate([test for test, _, _ in predictions])
@@ -68,11 +68,11 @@ def fit_head(samples: Samples) -> HeadReport | None:
     for name in dict.fromkeys(samples.objects):
         other, own = samples[samples.objects != name], samples[samples.objects == name]
         if len(other):
-            objects[str(name)] = _skill(own.success, *_predict(other, own))
+            objects[str(name)] = _measure_skill(own.success, *_predict(other, own))
     single_feature_auc = {name: _auc(samples.success, samples.features[:, n]) for n, name in enumerate(FEATURES)}
     return HeadReport(
         head=_fit_regularised(samples),
-        skill=_skill(evaluated.success, probabilities, rate),
+        skill=_measure_skill(evaluated.success, probabilities, rate),
         objects=objects,
         single_feature_auc=single_feature_auc,
         bins=_bins(evaluated.success, probabilities),
@@ -80,27 +80,27 @@ def fit_head(samples: Samples) -> HeadReport | None:
 
 
 def _predict(train: Samples, test: Samples) -> tuple[np.ndarray, np.ndarray]:
-    """Return what a head fitted to `train` says of `test`, (N,), and the share that success in `train`, (N,)."""
-    rate = np.full(len(test), np.clip(train.success.mean(), 1e-3, 1.0 - 1e-3))
-    return (
-        rate if train.success.all() or not train.success.any() else _fit_regularised(train).probability(test.features)
-    ), rate
+    """Return the probabilities (N,) that a head fitted to `train` predicts for `test`, and the rate of `train` (N,)."""
+    rate = np.full(len(test), np.clip(train.success.mean(), 1e-3, 1.0 - 1e-3))  # the log loss of 0 and 1 is infinite
+    if train.success.all() or not train.success.any():
+        return rate, rate
+    return _fit_regularised(train).probability(test.features), rate
 
 
 def _fit_regularised(samples: Samples) -> ScoringHead:
-    """Return the head with the penalty that cross-validation by scenario likes best."""
+    """Return the head with the penalty of the lowest loss, cross-validated by scenario."""
     losses = dict.fromkeys(PENALTIES, 0.0)
     for train, test in make_folds(samples.poses):
         part = samples[train]
         if part.success.all() or not part.success.any():
             continue
         for penalty in PENALTIES:
-            probabilities = _regression(part, penalty).probability(samples.features[test])
+            probabilities = _fit(part, penalty).probability(samples.features[test])
             losses[penalty] += _loss(samples.success[test], probabilities) * len(test)
-    return _regression(samples, min(PENALTIES, key=lambda penalty: losses[penalty]))
+    return _fit(samples, min(PENALTIES, key=lambda penalty: losses[penalty]))
 
 
-def _regression(samples: Samples, penalty: float) -> ScoringHead:
+def _fit(samples: Samples, penalty: float) -> ScoringHead:
     from sklearn.linear_model import LogisticRegression
 
     mean, scale = samples.features.mean(axis=0), samples.features.std(axis=0)
@@ -116,10 +116,10 @@ def _regression(samples: Samples, penalty: float) -> ScoringHead:
     )
 
 
-def _skill(success: np.ndarray, probabilities: np.ndarray, rate: np.ndarray) -> Skill:
+def _measure_skill(success: np.ndarray, probabilities: np.ndarray, rate: np.ndarray) -> Skill:
     return Skill(
         grasps=len(success),
-        success=int(success.sum()),
+        successes=int(success.sum()),
         auc=_auc(success, probabilities),
         log_loss=_loss(success, probabilities),
         log_loss_of_base_rate=_loss(success, rate),

@@ -1,4 +1,4 @@
-"""Proposes numbers for a ranking: the best logged variant, with thresholds that hold, without and with a head."""
+"""Proposals for a ranking: the best logged variant, with significant thresholds, without and with a head."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ FAMILIES = ("mvb", "full")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Draft:
-    """What the training rows say of one method."""
+    """Numbers fitted to the training rows for one method."""
 
     baseline: Ranking
     """Set by hand."""
@@ -35,7 +35,7 @@ class Draft:
     thresholds: Mapping[str, Threshold | None]
     """By their name in `Ranking`."""
     proposals: tuple[Proposal, ...]
-    """None, one without a head, one with it, or both."""
+    """At most two: without a head, and with it."""
 
 
 def baseline_ranking(name: str, config: RuntimeConfig) -> Ranking:
@@ -52,37 +52,37 @@ def draft(
     head: ScoringHead | None,
     folder: Path,
 ) -> Draft:
-    """Return what `train` proposes for the method `name`.
+    """Return the draft for the method `name`.
 
     Args:
-        name: one of `FAMILIES`, with episodes under its baseline-set values.
+        name: one of `FAMILIES`, with episodes under its hand-set values.
         train: rows of all methods.
-        config: what they were run with.
+        config: the settings of their run.
         reading: in which successes are counted.
         head: proposed in addition to the rest.
-        folder: where proposals that no logged method stands for are written, as scoring files.
+        folder: for the proposals that equal no logged method, as scoring files.
     """
-    baseline, by_reading = (
-        baseline_ranking(name, config),
-        {each: collect_outcomes(train, each) for each in get_args(Reading)},
-    )
+    baseline = baseline_ranking(name, config)
+    by_reading = {each: collect_outcomes(train, each) for each in get_args(Reading)}
     methods = find_variants(name, list(by_reading[reading]))
     rankings = {text: method.ranking(baseline) for text, method in methods.items()}
     variants = select_variant(by_reading, reading, list(methods), name)
-    thresholds = _thresholds(rankings, rankings[variants.chosen], train, reading)
+    thresholds = _fit_thresholds(rankings, rankings[variants.chosen], train, reading)
     held = {key: threshold.value for key, threshold in thresholds.items() if threshold and threshold.is_significant}
     plain = replace(rankings[variants.chosen], **held)
     proposed = [plain] if head is None else [plain, replace(plain, head=head)]
     logged = {ranking: text for text, ranking in rankings.items()}
     proposals = tuple(
-        Proposal(ranking=ranking, method=logged.get(ranking) or _filed(name, ranking, config, folder), results={})
+        Proposal(
+            ranking=ranking, method=logged.get(ranking) or _save_proposal(name, ranking, config, folder), results={}
+        )
         for ranking in proposed
         if ranking != baseline
     )
     return Draft(baseline=baseline, variants=variants, rankings=rankings, thresholds=thresholds, proposals=proposals)
 
 
-def _filed(name: str, ranking: Ranking, config: RuntimeConfig, folder: Path) -> str:
+def _save_proposal(name: str, ranking: Ranking, config: RuntimeConfig, folder: Path) -> str:
     """Write `ranking` as a scoring file of its own, named by its content; return the method that ranks by it."""
     both = {family: baseline_ranking(family, config) for family in FAMILIES} | {name: ranking}
     folder.mkdir(parents=True, exist_ok=True)
@@ -91,21 +91,20 @@ def _filed(name: str, ranking: Ranking, config: RuntimeConfig, folder: Path) -> 
     return f"{name}:scoring={path}"
 
 
-def _thresholds(
+def _fit_thresholds(
     rankings: Mapping[str, Ranking], best: Ranking, train: Sequence[Row], reading: Reading
 ) -> dict[str, Threshold | None]:
-    """Return the cuts of alignment and of the generator's score, from the method's own grasps.
+    """Return the thresholds of the alignment and of the generator's score, from the method's own grasps.
 
-    An alignment means something only beside the box and the k that it is taken with, so the variants that differ from
-    `best` in those are left out.
+    An alignment depends on the box and on k, so variants that differ from `best` in those are left out.
     """
-    alike = {
+    comparable = {
         text
         for text, ranking in rankings.items()
         if (ranking.box_method, ranking.k_faces) == (best.box_method, best.k_faces)
     }
-    known = list(labelled_grasps((row for row in train if row["method"] in alike), reading))
-    success = np.array([right for *_, right in known], dtype=bool)
+    known = list(labelled_grasps((row for row in train if row["method"] in comparable), reading))
+    success = np.array([succeeded for *_, succeeded in known], dtype=bool)
     poses = np.array([scenario_pose(row) for row, *_ in known], dtype=str)
     columns = {
         "min_alignment": {"first": "first_box_alignment", "grasp": "alignment"},

@@ -1,4 +1,4 @@
-"""Looks for a value below which grasps fail: one cut of one number, believed only if it holds out of its own fold."""
+"""Fit of a threshold below which grasps fail: one split of one number, tested outside of its own fold."""
 
 from __future__ import annotations
 
@@ -10,56 +10,57 @@ from scipy.stats import fisher_exact
 from sim_twin.benchmark.tuning.folds import make_folds
 
 MIN_GRASPS_PER_SIDE = 5
-"""Fewest grasps below a cut."""
+"""Minimum number of grasps on either side of a split."""
 MAX_P = 0.05
+"""Significance level of Fisher's test, the usual one."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Threshold:
-    """A cut and what speaks for it."""
+    """A split and its evidence."""
 
     value: float
     """Grasps below it failed more often."""
     below: tuple[int, int]
-    """Successes and grasps below the cuts of the folds that they had no part in."""
+    """Successes and grasps below the splits of the folds that do not contain them."""
     above: tuple[int, int]
     """The same at or above them."""
     p: float
-    """Fisher's exact test, one-sided, of those."""
+    """Fisher's exact test, one-sided, of these counts."""
 
     @property
     def is_significant(self) -> bool:
-        """Return whether it is believed."""
+        """Return whether the failures below it are more than chance."""
         return self.p < MAX_P
 
 
 def fit_threshold(values: np.ndarray, success: np.ndarray, poses: np.ndarray) -> Threshold | None:
-    """Return the cut that parts failures best from successes; None where none leaves `MIN_GRASPS_PER_SIDE` grasps on both sides.
+    """Return the split of failures from successes with the greatest likelihood; None where no side is large enough.
 
     Args:
         values: (N,) of each grasp; NaN ones are left out.
         success: (N,) bool.
-        poses: (N,) the scenarios without their seeds, by which it is cross-validated.
+        poses: (N,) the scenarios without their seeds, the groups of the cross-validation.
     """
     known = np.isfinite(values)
     values, success, poses = values[known], success[known], poses[known]
-    value = _best_cut(values, success)
+    value = _best_split(values, success)
     if value is None:
         return None
-    tally = np.zeros((2, 2), dtype=int)  # below, above; failed, worked
+    counts = np.zeros((2, 2), dtype=int)  # below, above; failures, successes
     for train, test in make_folds(poses):
-        cut = _best_cut(values[train], success[train])
-        if cut is not None:
-            np.add.at(tally, ((values[test] >= cut).astype(int), success[test].astype(int)), 1)
+        split = _best_split(values[train], success[train])
+        if split is not None:
+            np.add.at(counts, ((values[test] >= split).astype(int), success[test].astype(int)), 1)
     return Threshold(
         value=value,
-        below=(int(tally[0, 1]), int(tally[0].sum())),
-        above=(int(tally[1, 1]), int(tally[1].sum())),
-        p=float(fisher_exact(tally, alternative="greater")[1]),  # pyright: ignore[reportArgumentType]
+        below=(int(counts[0, 1]), int(counts[0].sum())),
+        above=(int(counts[1, 1]), int(counts[1].sum())),
+        p=float(fisher_exact(counts, alternative="greater")[1]),  # pyright: ignore[reportArgumentType]
     )
 
 
-def _best_cut(values: np.ndarray, success: np.ndarray) -> float | None:
+def _best_split(values: np.ndarray, success: np.ndarray) -> float | None:
     """Return the midpoint between two values that gives the labels the greatest likelihood, failures below."""
     order = np.argsort(values, kind="stable")
     values, labels = values[order], success[order].astype(float)

@@ -1,4 +1,4 @@
-"""Chooses among variants of a method that were all run on the same candidates, and says what such a choice is worth."""
+"""Choice among variants of a method run on the same candidates, with its cross-validated worth."""
 
 from __future__ import annotations
 
@@ -13,27 +13,27 @@ from z1_runtime.grasping.ranking import Ranking
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Variants:
-    """What was learned from the variants of one method."""
+    """Comparison of the variants of one method."""
 
     names: tuple[str, ...]
-    """All that were compared, the hand-set one first."""
+    """All variants compared, the hand-set one first."""
     successes: Mapping[str, Mapping[str, int]]
     """By reading and variant, on all training scenarios."""
     scenarios: int
-    """Training scenarios that all of them have."""
+    """Training scenarios common to all of them."""
     chosen: str
     """The best on all of them."""
     by_fold: tuple[str, ...]
     """The best on each fold's training part."""
     cross_validated: int
-    """Successes of those on the part that they were not chosen on: what choosing so is worth on new scenarios."""
+    """Successes of these on the other part of each fold: the worth of this choice on new scenarios."""
 
 
 def find_variants(family: str, names: Sequence[str]) -> dict[str, Method]:
-    """Return those of `names` that are variants of `family` and that a scoring can express, the baseline-set one first.
+    """Return those of `names` that are variants of `family` and that a scoring can express, the hand-set one first.
 
     Raises:
-        ScoringError: a variant's scoring file is not there any more.
+        ScoringError: a variant's scoring file is missing.
     """
     own = [name for name in names if name.partition(":")[0] == family]
     methods = {name: parse_method(name) for name in sorted(own, key=lambda name: (name != family, name))}
@@ -51,18 +51,18 @@ def select_variant(
         names: the variants, with `baseline` among them.
         baseline: the one whose numbers are set by hand.
     """
-    collect_outcomes = by_reading[reading]
-    shared = sorted(set.intersection(*(set(collect_outcomes[name]) for name in names)))
+    outcomes = by_reading[reading]
+    shared = sorted(set.intersection(*(set(outcomes[name]) for name in names)))
     poses = [scenario.rpartition("-s")[0] for scenario in shared]
     names = [baseline, *(name for name in names if name != baseline)]
 
     def best(scenarios: Sequence[str]) -> str:
-        return max(names, key=lambda name: sum(collect_outcomes[name][scenario] for scenario in scenarios))
+        return max(names, key=lambda name: sum(outcomes[name][scenario] for scenario in scenarios))
 
-    by_fold, right = [], 0
+    by_fold, successes = [], 0
     for train, test in make_folds(poses):
         by_fold.append(best([shared[n] for n in train]))
-        right += sum(collect_outcomes[by_fold[-1]][shared[n]] for n in test)
+        successes += sum(outcomes[by_fold[-1]][shared[n]] for n in test)
     return Variants(
         names=tuple(names),
         successes={
@@ -72,7 +72,7 @@ def select_variant(
         scenarios=len(shared),
         chosen=best(shared),
         by_fold=tuple(by_fold),
-        cross_validated=right,
+        cross_validated=successes,
     )
 
 

@@ -40,7 +40,7 @@ def test_a_run_of_a_users_mesh_writes_all_that_it_says(short, tmp_path, capsys):
     (recording,) = (out / "recordings").iterdir()
     assert picture.stem == recording.stem == f"{row['scenario']}-mvb"
     page = (out / "report.html").read_text()
-    assert f"href='recordings/{row['scenario'].replace('+', '%2B')}-mvb.rrd'" in page
+    assert f'href="recordings/{row["scenario"].replace("+", "%2B")}-mvb.rrd"' in page
     assert "within 2" in capsys.readouterr().out
 
     with raises(OutputExistsError, "output_exists"):

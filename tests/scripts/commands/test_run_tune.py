@@ -6,7 +6,7 @@ import sys
 import pytest
 
 from scripts.cli import main as z1
-from scripts.commands.run_tune import Config, _held_out, main
+from scripts.commands.run_tune import Config, _default_held_out, main
 from sim_twin.benchmark.episodes import runner
 from sim_twin.benchmark.episodes.scenarios import grid
 from sim_twin.benchmark.tuning.folds import NoSklearnError
@@ -66,7 +66,7 @@ def test_fitted_values_that_win_are_written_and_loaded_by_the_runtime(log, tmp_p
     assert "No head was fitted" in format_ranking
     scoring = load_scoring(out / "scoring.yaml")
     assert scoring.tuned == ("mvb", "full")
-    assert scoring.evidence["judged_on_seeds"] == [2]
+    assert scoring.evidence["evaluated_on_seeds"] == [2]
     assert scoring.evidence["evaluated"]["mvb"][0]["top1"]["tuned"] == 81
     assert ranking_of(RuntimeConfig(scoring=str(out / "scoring.yaml"))).k_faces == 3
     assert json.loads((out / "tuning.json").read_text())["verdicts"]["full"].startswith("took k=3")
@@ -96,8 +96,8 @@ def test_nothing_is_run_when_that_is_forbidden(log, tmp_path, monkeypatch, capsy
 
 
 def test_the_last_seed_is_held_out_or_the_one_after_the_only_one():
-    assert _held_out((0, 3, 5)) == (5,)
-    assert _held_out((4,)) == (5,)
+    assert _default_held_out((0, 3, 5)) == (5,)
+    assert _default_held_out((4,)) == (5,)
 
 
 def test_bad_calls_are_told_in_a_line(tmp_path, capsys):
