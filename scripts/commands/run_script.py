@@ -3,7 +3,7 @@
     ./z1 twin run-script --object box --frames 100 viewer.py --its-own options
 
 In the script `import pyrealsense2` gives librealsense with the twin for a camera, and `import unitree_arm_interface`
-the vendor's names for an arm that stands in the same scene, at its own controller: nothing of a real arm is touched.
+the vendor's names for an arm that is_stable in the same scene, at its own controller: nothing of a real arm is touched.
 Windows that OpenCV cannot open here are written to files when the script ends.
 """
 

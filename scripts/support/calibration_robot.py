@@ -99,7 +99,7 @@ def _served_truth(bus: BusConfig, undo: ExitStack) -> Callable[[], GroundTruth] 
 
     client = undo.enter_context(GroundTruthClient(bus))
     try:
-        return client.truth if client.truth().T_base_board is not None else None
+        return client.read if client.read().T_base_board is not None else None
     except HalTimeoutError:
         return None
 

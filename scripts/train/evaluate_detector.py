@@ -162,7 +162,7 @@ def twin_views() -> Iterator[tuple[Scenario, LabelledImage]]:
             mujoco.mj_camlight(world.model, data)
             view = renderer.render(data)
             colour = measure_colour(view.colour, scenario.draw_seed, 0)
-            yield scenario, LabelledImage(colour=colour, labels=(Label(name=name, mask=view.mask),), look="twin")
+            yield scenario, LabelledImage(colour=colour, labels=(Label(name=name, mask=view.mask),), appearance="twin")
         renderer.close()
 
 
@@ -176,7 +176,7 @@ def spoilt_views(look: Appearance) -> Iterator[tuple[Scenario, LabelledImage]]:
         yield (
             scenario,
             draw_scenario(
-                renderer, scenario.object, scenario.scene().T_base_object(), rng, look=look, jaw_rad=_JAW_RAD
+                renderer, scenario.object, scenario.scene().T_base_object(), rng, appearance=look, jaw_rad=_JAW_RAD
             ),
         )
     renderer.close()

@@ -109,7 +109,7 @@ def make_shard(shard: Shard) -> None:
     renderer = SceneRenderer(shard.seed)
     for number in range(shard.count):
         picture = draw_scene(renderer, np.random.default_rng([shard.seed, 2, number]), shard.mix)
-        name = f"{number:04d}_{picture.look}"
+        name = f"{number:04d}_{picture.appearance}"
         _write_picture(picture, images / f"{name}.jpg", labels / f"{name}.txt")
     renderer.close()
     if shard.folder.is_dir():  # another process was faster

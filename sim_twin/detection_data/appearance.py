@@ -1,4 +1,4 @@
-"""How everything on a detector's stage looks: as in the twin, or with new colours, textures and lights."""
+"""Appearance of a detector's scene: the twin's own, or domain-randomised colours, textures and lights."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ from collections.abc import Collection
 import mujoco
 import numpy as np
 
-from sim_twin.detection_data.props import HIDDEN_GROUP
+from sim_twin.detection_data.props import UNDRAWN_GROUP
 from sim_twin.detection_data.scene_renderer import FLAT_PX, LIGHTS, SKIN_PX, SKINS, WALLS, PropInstance, SceneRenderer
 from sim_twin.detection_data.textures import random_rgb, random_texture
 from sim_twin.model.scene import TABLE_RGBA
 from sim_twin.model.z1_mjcf import GROUP_SCENE
 
 _TEXTURED = 0.35
-"""How many things have a texture; the others have one colour."""
+"""Ratio of props with a texture; the others have one colour."""
 
 
 def apply_twin_appearance(renderer: SceneRenderer) -> None:
-    """Give table, floor, walls and lights the twin's own look, and every nominal actor its own colours."""
+    """Give table, floor, walls and lights the twin's own appearance, and every nominal prop its own colours."""
     model = renderer.model
     for name in ("floor", "table"):
         renderer.set_texture(name, np.full((FLAT_PX, FLAT_PX, 3), 255, np.uint8))
@@ -26,7 +26,7 @@ def apply_twin_appearance(renderer: SceneRenderer) -> None:
     sky = np.linspace([0.93, 0.95, 0.97], [0.55, 0.66, 0.78], FLAT_PX)[:, None] * np.ones((1, FLAT_PX, 1))
     renderer.set_texture("sky", np.tile((sky * 255).astype(np.uint8), (6, 1, 1)))
     for number in range(WALLS):
-        model.geom(f"wall_{number}").group = HIDDEN_GROUP
+        model.geom(f"wall_{number}").group = UNDRAWN_GROUP
     for instance in renderer.props:
         _apply_own_colours(model, instance)
     model.geom_rgba[renderer.arm_geoms] = renderer.arm_rgba
@@ -37,15 +37,17 @@ def apply_twin_appearance(renderer: SceneRenderer) -> None:
     model.vis.headlight.ambient, model.vis.headlight.diffuse = [0.30, 0.30, 0.32], [0.25] * 3
 
 
-def randomize_appearance(renderer: SceneRenderer, rng: np.random.Generator, but: Collection[PropInstance] = ()) -> None:
-    """Give everything new colours, textures and lights; the actors `but` keep their own colours."""
+def randomize_appearance(
+    renderer: SceneRenderer, rng: np.random.Generator, keep: Collection[PropInstance] = ()
+) -> None:
+    """Give everything new colours, textures and lights; the props `keep` keep their own colours."""
     _randomize_surroundings(renderer, rng)
     for number in rng.permutation(SKINS)[:4]:  # the others keep theirs from earlier pictures
         side = random_texture(rng, SKIN_PX)
         renderer.set_texture(f"skin_{number}", np.tile(side, (6, 1, 1)))  # six of its own make a cylinder a box
     for instance in renderer.props:
         _randomize_prop(renderer.model, instance, rng)
-    for instance in but:
+    for instance in keep:
         _apply_own_colours(renderer.model, instance)
     tint = np.append(rng.uniform(0.75, 1.2, 3) if rng.random() < 0.5 else np.ones(3), 1.0)
     grey = rng.uniform(0.0, 0.15)
@@ -66,7 +68,7 @@ def _randomize_surroundings(renderer: SceneRenderer, rng: np.random.Generator) -
         renderer.set_texture("sky", np.tile(random_texture(rng, FLAT_PX), (6, 1, 1)))
     for number in range(WALLS):
         wall = model.geom(f"wall_{number}")
-        wall.group = GROUP_SCENE if rng.random() < 0.5 else HIDDEN_GROUP
+        wall.group = GROUP_SCENE if rng.random() < 0.5 else UNDRAWN_GROUP
         angle, far = rng.uniform(-1.3, 1.3), rng.uniform(1.2, 3.0)
         wall.pos = [far * np.cos(angle), far * np.sin(angle), rng.uniform(-0.5, 0.6)]
         half = rng.uniform(-0.5, 0.5)

@@ -1,4 +1,4 @@
-"""What a camera does to a picture: exposure, white balance, blur, noise, vignetting and JPEG."""
+"""Photometric augmentation of an image: exposure, white balance, blur, noise, vignetting and JPEG."""
 
 from __future__ import annotations
 

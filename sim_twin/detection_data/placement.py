@@ -1,4 +1,4 @@
-"""Where camera, objects and what is none stand in a detector's picture."""
+"""Poses of camera, objects and distractors in a detector's image."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from sim_twin.detection_data.props import CLASSES
 from sim_twin.detection_data.scene_renderer import PropInstance, SceneRenderer
 
 NEAREST_M = 0.05
-"""No corner of an object comes nearer to the lens [m]."""
+"""Minimum distance of an object's corners from the lens [m]."""
 _JAW_POINTS = ((0.05, 0, 0), (0.10, 0, 0), (0.14, 0, 0), (0.18, 0, 0), (0.20, 0, 0), (0.03, 0.14, 0))
-"""Points of hand and camera in the flange frame that no object may contain [m]."""
+"""Points of gripper and camera in the flange frame that no object may contain [m]."""
 _END_ON_COS = np.cos(np.deg2rad(25))
-"""Nearer to its axis than this, a bottle or a cylinder looks like any disc."""
+"""Cosine above which a view along its axis shows a bottle or a cylinder as any disc."""
 _TRIES = 60
 
 
 def place_camera(renderer: SceneRenderer, by_wrist: bool, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Return T_base_camera (4, 4) and the point (3,) it looks at, mid-height of a thing on the table."""
+    """Return T_base_camera (4, 4) and the point (3,) in view, mid-height of an object on the table."""
     for _ in range(1000):
         if by_wrist:
             pose = renderer.set_arm(_random_joints(rng))
@@ -53,8 +53,8 @@ def _random_view(rng: np.random.Generator) -> np.ndarray:
     target = np.array([rng.uniform(0.25, 0.75), rng.uniform(-0.3, 0.3), rng.uniform(0.02, 0.15)])
     azimuth, elevation = rng.uniform(-np.pi, np.pi), np.deg2rad(rng.triangular(0, 20, 60))
     c = np.cos(elevation)
-    away = np.array([c * np.cos(azimuth), c * np.sin(azimuth), np.sin(elevation)])
-    place = target + rng.uniform(0.22, 0.75) * away
+    direction = np.array([c * np.cos(azimuth), c * np.sin(azimuth), np.sin(elevation)])
+    place = target + rng.uniform(0.22, 0.75) * direction
     place[2] = max(place[2], 0.02)
     forward = (target - place) / np.linalg.norm(target - place)
     right = np.cross(forward, [0.0, 0.0, 1.0])
@@ -68,10 +68,10 @@ def _random_view(rng: np.random.Generator) -> np.ndarray:
 
 
 def _choose_target(renderer: SceneRenderer, T_base_camera: np.ndarray, rng: np.random.Generator) -> np.ndarray | None:
-    """Return where a ray through a random pixel meets mid-height above the table, 0.13 to 0.85 m off; or None."""
+    """Return the point (3,) of a random pixel's ray at mid-height above the table, at a depth of 0.13 to 0.85 m; or None."""
     i = renderer.intrinsics
     u, v = rng.uniform(0.08, 0.92) * i.width, rng.uniform(0.15, 0.85) * i.height
-    ray = T_base_camera[:3, :3] @ [(u - i.cx) / i.fx, (v - i.cy) / i.fy, 1.0]
+    ray = T_base_camera[:3, :3] @ i.deproject(np.array([u]), np.array([v]), np.ones(1))[0]
     place = T_base_camera[:3, 3]
     if abs(ray[2]) < 0.02:
         return None
@@ -90,7 +90,7 @@ def _gripper_clears_table(renderer: SceneRenderer) -> bool:
 def choose_objects(
     renderer: SceneRenderer, rng: np.random.Generator, *, nominal: float, crowd: bool
 ) -> list[PropInstance]:
-    """One to three objects, or up to eight; a share of `nominal` of them are the benchmark's own."""
+    """One to three objects, or up to eight; the ratio `nominal` of them are the benchmark's own."""
     chosen: list[PropInstance] = []
     for _ in range(rng.integers(6, 12) if crowd else rng.choice([1, 2, 3], p=[0.55, 0.3, 0.15])):
         props = renderer.named(str(rng.choice(CLASSES)))
@@ -101,7 +101,7 @@ def choose_objects(
 
 
 def _random_lean(rng: np.random.Generator) -> np.ndarray:
-    """A rotation (3, 3): standing, leaning up to 60° or lying, turned anyhow about the vertical."""
+    """Return a rotation (3, 3): upright, leaning up to 60° or horizontal, at any angle about the vertical."""
     kind = rng.random()
     lean = 0.0 if kind < 0.4 else rng.uniform(-np.pi / 3, np.pi / 3) if kind < 0.8 else np.pi / 2
     about = 0.0 if rng.random() < 0.5 else rng.uniform(-np.pi, np.pi)  # half of them lean to or from the arm
@@ -139,7 +139,7 @@ def place_objects(
     end_on: bool,
     rng: np.random.Generator,
 ) -> list[np.ndarray]:
-    """Put the first object at `centre`, the others near it, or in a crowd wherever the camera looks.
+    """Put the first object at `centre`, the others near it, or in a crowd anywhere in the camera's view.
 
     Unless `end_on`, no bottle or cylinder points at the lens, where only colours tell it from any disc.
 
@@ -175,7 +175,7 @@ def _fits(
     T_base_camera: np.ndarray,
     by_wrist: bool,
 ) -> bool:
-    """True when the object is on the table, clear of lens, hand and the other objects' middles."""
+    """True when the object is on the table, clear of lens, gripper and the other objects' middles."""
     if not (-0.25 < pose[0, 3] < 0.97 and abs(pose[1, 3]) < 0.57):
         return False
     if any(np.linalg.norm(pose[:3, 3] - other[:3, 3]) < 0.085 for other in others):
@@ -208,9 +208,9 @@ def place_distractors(
     spread: bool,
     rng: np.random.Generator,
 ) -> None:
-    """Put things of no class, `number` in the mean, apart from the objects at `places` and from the lens.
+    """Put distractors, `number` in the mean, apart from the objects at `places` and from the lens.
 
-    They stand around `centre` (3,), or, if `spread`, wherever the camera looks.
+    Their places are around `centre` (3,), or, if `spread`, anywhere in the camera's view.
     """
     others = renderer.distractors()
     for instance in (others[k] for k in rng.permutation(len(others))[: rng.poisson(number)]):
@@ -229,15 +229,15 @@ def place_distractors(
 def place_occluder(
     renderer: SceneRenderer, T_base_object: np.ndarray, T_base_camera: np.ndarray, rng: np.random.Generator
 ) -> None:
-    """Put a distractor on the way from the lens to the object, a little aside."""
+    """Put a distractor near the line from the lens to the object."""
     instance = renderer.distractors()[rng.integers(len(renderer.distractors()))]
     way = T_base_object[:3, 3] - T_base_camera[:3, 3]
     far = float(np.linalg.norm(way))
     if far < 0.25:
         return
-    aside = T_base_camera[:3, :2] @ rng.normal(0.0, 0.035, 2)
+    offset = T_base_camera[:3, :2] @ rng.normal(0.0, 0.035, 2)
     pose = np.eye(4)
     pose[:3, :3] = _random_lean(rng)
-    pose[:3, 3] = T_base_camera[:3, 3] + way * (1.0 - rng.uniform(0.09, 0.13) / far) + aside
+    pose[:3, 3] = T_base_camera[:3, 3] + way * (1.0 - rng.uniform(0.09, 0.13) / far) + offset
     if np.linalg.norm(pose[:3, 3] - T_base_camera[:3, 3]) > 0.14:
         renderer.put(instance, pose)

@@ -1,6 +1,6 @@
-"""A stage for a detector's pictures: arm, table, lights and a pool of props in one compiled model.
+"""Renderer of a detector's images: arm, table, lights and a pool of props in one compiled model.
 
-Everything that changes from picture to picture (poses, colours, textures, lights) changes inside the compiled model.
+Everything that changes from image to image (poses, colours, textures, lights) changes inside the compiled model.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from sim_twin.camera.gl import Canvas
 from sim_twin.camera.render import set_pinhole
 from sim_twin.detection_data.props import (
     CLASSES,
-    HIDDEN_GROUP,
+    UNDRAWN_GROUP,
     Prop,
     add_prop,
     make_class_prop,
@@ -27,10 +27,10 @@ from sim_twin.detection_data.props import (
 from sim_twin.model.z1_mjcf import GROUP_ARM, GROUP_MOUNT, GROUP_SCENE, GROUP_VISUAL, add_z1
 
 VARIANTS = 3
-"""Props of each class beside the nominal one."""
+"""Props of each class in addition to the nominal one."""
 DISTRACTORS = 14
 SKINS, SKIN_PX = 10, 64
-"""Textures that things may have, `skin_0` …, and how wide each of a skin's six sides is."""
+"""Number of textures of the props, `skin_0` …, and width of each of a skin's six sides."""
 FLAT_PX = 256
 """Width of the textures `floor`, `table` and of each side of `sky`."""
 LIGHTS, WALLS = 3, 4
@@ -39,7 +39,7 @@ _GEOMS_DRAWN = 800
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PropInstance:
-    """A prop on the stage, with the numbers of its body and geoms in the model."""
+    """A prop of the renderer, with the numbers of its body and geoms in the model."""
 
     prop: Prop
     mocap: int
@@ -47,7 +47,7 @@ class PropInstance:
 
 
 class SceneRenderer:
-    """Draws pictures with exact instance masks; belongs to the thread that made it.
+    """Renderer of images with exact instance masks; belongs to the thread that made it.
 
     Args:
         seed: of the props' proportions.
@@ -74,24 +74,24 @@ class SceneRenderer:
         self._pixels = np.empty((intrinsics.height, intrinsics.width, 3), np.uint8)
 
     def named(self, kind: str) -> list[PropInstance]:
-        """Return the actors of a class, the nominal one first."""
+        """Return the props of a class, the nominal one first."""
         return [instance for instance in self.props if instance.prop.kind == kind]
 
     def distractors(self) -> list[PropInstance]:
-        """Return the actors of no class."""
+        """Return the props of no class."""
         return [instance for instance in self.props if instance.prop.kind not in CLASSES]
 
     def clear(self) -> None:
-        """Take every actor off the stage."""
+        """Remove every prop from the scene."""
         for instance in self.props:
             self.hide(instance)
 
     def hide(self, instance: PropInstance) -> None:
-        """Take `instance` off the renderer."""
-        self.model.geom_group[instance.geoms] = HIDDEN_GROUP
+        """Remove `instance` from the scene."""
+        self.model.geom_group[instance.geoms] = UNDRAWN_GROUP
 
     def is_shown(self, instance: PropInstance) -> bool:
-        """Return whether `instance` is on the renderer."""
+        """Return whether `instance` is in the scene."""
         return bool(self.model.geom_group[instance.geoms[0]] == GROUP_SCENE)
 
     def put(self, instance: PropInstance, T_base_prop: np.ndarray) -> None:
@@ -102,7 +102,7 @@ class SceneRenderer:
         self.data.mocap_pos[instance.mocap], self.data.mocap_quat[instance.mocap] = T_base_prop[:3, 3], quat
 
     def pose(self, instance: PropInstance) -> np.ndarray:
-        """Return where `instance` was put, T_base_prop (4, 4)."""
+        """Return the pose T_base_prop (4, 4) of `instance`."""
         pose, rotation = np.eye(4), np.empty(9)
         mujoco.mju_quat2Mat(rotation, self.data.mocap_quat[instance.mocap])
         pose[:3, :3], pose[:3, 3] = rotation.reshape(3, 3), self.data.mocap_pos[instance.mocap]
@@ -143,7 +143,7 @@ class SceneRenderer:
 
         Args:
             camera: `wrist` or `free`.
-            arm: `pieces`, as the twin's wrist camera sees it, `whole` with its camera, or `none`.
+            arm: `pieces`, as in the twin's wrist camera, `whole` with its camera, or `none`.
             shadows: whether lights throw them.
         """
         self._update_scene(camera, arm, shadows)
@@ -151,7 +151,7 @@ class SceneRenderer:
         return np.ascontiguousarray(self._pixels[::-1])
 
     def draw_instances(self, camera: str, arm: str) -> np.ndarray:
-        """Return which actor (index in `props`) each pixel (H, W) int16 is_shown; −1 = none."""
+        """Return the index in `props` of each pixel's prop, (H, W) int16; −1 = none."""
         self._update_scene(camera, arm, False)
         by_number = [int(mujoco.mjtRndFlag.mjRND_SEGMENT), int(mujoco.mjtRndFlag.mjRND_IDCOLOR)]
         self._scene.flags[by_number] = True

@@ -1,4 +1,4 @@
-"""Procedural textures: what tables, floors, walls and things might look like, from a random generator alone."""
+"""Procedural textures: surfaces of tables, floors, walls and props, from a random generator alone."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 _QUIET = 0.75
-"""Share of quiet surfaces: few tables and fewer packages are in loud checks."""
+"""Ratio of quiet surfaces: few tables and fewer packages are in loud checks."""
 
 
 def random_rgb(rng: np.random.Generator) -> np.ndarray:
@@ -20,11 +20,11 @@ def random_rgb(rng: np.random.Generator) -> np.ndarray:
 def random_texture(rng: np.random.Generator, size: int) -> np.ndarray:
     """Return a picture (size, size, 3) uint8 of a random kind, some of them smudged."""
     kind = _KINDS[rng.integers(len(_KINDS))]
-    share = kind(rng, size)[..., None]
+    blend = kind(rng, size)[..., None]
     low, high = random_rgb(rng), random_rgb(rng)
     if rng.random() < _QUIET:  # both colours alike
         high = np.clip(low + rng.normal(0.0, 0.08, 3), 0.0, 1.0)
-    picture = low + (high - low) * share
+    picture = low + (high - low) * blend
     if rng.random() < 0.5:
         picture = picture * (1.0 - rng.uniform(0.05, 0.35) * _clouds(rng, size)[..., None])
     return (np.clip(picture, 0.0, 1.0) * 255).astype(np.uint8)

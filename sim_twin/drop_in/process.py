@@ -31,7 +31,7 @@ class WireProcess(SceneView):
     `close`, the last reference to this, or the end of this process.
 
     Args:
-        config: what stands where.
+        config: what is_stable where.
         wire: where it listens.
         q_start: (7,) where the arm starts [rad]; by default at home.
     """
@@ -146,7 +146,7 @@ def make_twin(
     """Return a new world behind what `wire` says it is.
 
     Args:
-        scene: what stands where.
+        scene: what is_stable where.
         wire: which depth.
         q_start: (7,) where the arm starts [rad]; by default at home.
         ailments: a record of `sim_twin.controller.fault_injection.AILMENTS`, written into from outside.

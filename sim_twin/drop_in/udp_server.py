@@ -65,7 +65,7 @@ class WireServer:
     dropped.
 
     Args:
-        twin: the arm, and what stands before it.
+        twin: the arm, and what is_stable before it.
         config: where it is.
         clock: the wall's.
         on_step: called after the world has gone on, by 4 ms at most.

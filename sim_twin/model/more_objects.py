@@ -1,6 +1,6 @@
-"""Things to grasp that the paper has not: hollow, thin, leaning, with handles; each stands by itself.
+"""Graspable objects that the paper does not have: hollow, thin, leaning, with handles; each is stable upright.
 
-Every one has a place that the jaws (65 mm) can take, though for some it is only a rim, a neck or a handle.
+Every one has a place that the jaws (65 mm) can grasp, though for some it is only a rim, a neck or a handle.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ _BALL_RADIUS_M, _BALL_FLAT_M = 0.031, 0.012
 
 
 def _ball_profile() -> tuple[tuple[float, float], ...]:
-    """Return a sphere that lies on a flat, as a lathe's profile."""
+    """Return the profile of a sphere with a flat foot."""
     foot = np.sqrt(_BALL_RADIUS_M**2 - _BALL_FLAT_M**2)
     heights = np.linspace(-foot, 0.998 * _BALL_RADIUS_M, 13)
     return tuple((float(z + foot), float(np.sqrt(_BALL_RADIUS_M**2 - z * z))) for z in heights)
@@ -77,7 +77,7 @@ def _ball_profile() -> tuple[tuple[float, float], ...]:
 _HEXAGON = 0.030 * np.array([[np.cos(a), np.sin(a)] for a in np.arange(6) * np.pi / 3])
 
 EXTENDED: dict[str, GraspObject] = {
-    # A juggling ball: leather round millet, which lies on a flat of its own weight's making and so does not roll.
+    # A juggling ball: leather around millet; its weight flattens the foot, so that it does not roll.
     "ball": GraspObject(height_m=_ball_profile()[-1][0], parts=make_homogeneous_lathe(_ball_profile(), 0.13, _RED)),
     # A cereal bowl of melamine: 110 mm at the rim, too wide for the jaws; 4 mm of wall can be taken.
     "bowl": GraspObject(
@@ -119,7 +119,7 @@ EXTENDED: dict[str, GraspObject] = {
             _box((0.030, 0.030, 0.080), (0.0, -0.030, 0.015), 0.050, _WOOD),
         ),
     ),
-    # A small stoneware mug; the handle stands across the view.
+    # A small stoneware mug; the handle is across the view.
     "mug": GraspObject(
         height_m=0.080,
         parts=(
@@ -160,7 +160,7 @@ EXTENDED: dict[str, GraspObject] = {
             _box((0.008, 0.014, 0.035), (-0.034, 0.0, 0.0475), 0.003, _RED),
         ),
     ),
-    # Parcel tape on its core, lying: 90 mm across, the ring 17 mm thick.
+    # Parcel tape on its core, flat on the table: 90 mm across, the ring 17 mm thick.
     "tape_roll": GraspObject(
         height_m=0.048, parts=make_wall((0.028, 0.045), (0.028, 0.045), (-0.024, 0.024), 0.16, _YELLOW)
     ),

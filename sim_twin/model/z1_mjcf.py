@@ -14,13 +14,13 @@ from hal.base.z1_model import rigid_body_model
 from sim_twin.model.convex import JAW_LINKS, load_visual_mesh, split_convex
 
 GROUP_SCENE = 0
-"""Table and object: seen by every camera, collides."""
+"""Table and object: visible to every camera, collides."""
 GROUP_VISUAL = 1
-"""The arm's full meshes: seen from outside only."""
+"""The arm's full meshes: visible from outside only."""
 GROUP_ARM = 3
-"""The arm's convex pieces: they collide, and the wrist camera sees them (within 0.6 mm of the mesh at the jaws)."""
+"""The arm's convex pieces: they collide and are visible to the wrist camera (within 0.6 mm of the mesh at the jaws)."""
 GROUP_MOUNT = 4
-"""Camera housing and bracket: seen from outside only, as the lens sits behind its own glass."""
+"""Camera housing and bracket: visible from outside only, as the lens is behind its own glass."""
 
 # Collision classes: `contype`, `conaffinity`. Upper arm and forearm do not collide with each other: the vendor's joint
 # limits keep them apart, and their hulls overlap at the joints.
@@ -134,7 +134,7 @@ def _add_joint(body: mujoco.MjsBody, link: _Link, index: int) -> None:
         damping=[link.damping, 0.0, 0.0],
         frictionloss=FRICTIONLOSS[index],
         armature=ARMATURE[index],
-        # Gravity compensation is part of the motor's torque, as in the vendor's controller, and shares its limit.
+        # Gravity compensation is part of the motor's torque, as in the vendor's controller, and counts towards its limit.
         actgravcomp=True,
         actfrclimited=True,
         actfrcrange=[-z1.TAU_MAX[index], z1.TAU_MAX[index]],
@@ -172,7 +172,7 @@ def _add_geoms(spec: mujoco.MjSpec, body: mujoco.MjsBody, name: str) -> None:
         conaffinity=0,
         material=colour,
     )
-    hand = jaw or name in ("link05", "link06")
+    is_gripper = jaw or name in ("link05", "link06")
     for number, corners in enumerate(split_convex(name)):
         piece = spec.add_mesh(name=f"{name}_{number}", smoothnormal=False)
         piece.uservert = corners.ravel()
@@ -181,8 +181,8 @@ def _add_geoms(spec: mujoco.MjSpec, body: mujoco.MjsBody, name: str) -> None:
             type=mujoco.mjtGeom.mjGEOM_MESH,
             meshname=piece.name,
             group=GROUP_ARM,
-            contype=BIT_GRIPPER if hand else BIT_BASE,
-            conaffinity=BIT_SCENE | (BIT_BASE if hand else BIT_GRIPPER),
+            contype=BIT_GRIPPER if is_gripper else BIT_BASE,
+            conaffinity=BIT_SCENE | (BIT_BASE if is_gripper else BIT_GRIPPER),
             condim=6 if jaw else 3,
             priority=1 if jaw else 0,
             friction=JAW_FRICTION if jaw else (0.3, 0.005, 0.0001),
@@ -224,5 +224,5 @@ def _add_mount(flange: mujoco.MjsBody, pose: np.ndarray) -> None:
         material="bracket",
         **common,
     )
-    # MuJoCo cameras look along −z with y up: half a turn about x from the optical frame.
+    # MuJoCo's cameras point along −z with y up: half a turn about x from the optical frame.
     camera.add_camera(name="wrist", quat=[0.0, 1.0, 0.0, 0.0])

@@ -38,7 +38,7 @@ def bus() -> Iterator[BusConfig]:
 def test_the_truth_crosses_the_link_unchanged(bus: BusConfig, world: World) -> None:
     server, here = GroundTruthServer(bus, world), read_ground_truth(world)
     with GroundTruthClient(bus) as client:
-        there = client.truth()
+        there = client.read()
     server.close()
     assert there.object == "bottle"
     assert there.lifted_m == here.lifted_m
@@ -49,7 +49,7 @@ def test_the_truth_crosses_the_link_unchanged(bus: BusConfig, world: World) -> N
 def test_a_robot_that_is_no_twin_is_a_clear_error(bus: BusConfig, world: World) -> None:
     GroundTruthServer(bus, world).close()
     with GroundTruthClient(bus) as client, pytest.raises(HalTimeoutError, match="only a simulated HAL knows the truth"):
-        client.truth()
+        client.read()
 
 
 def test_a_program_that_forgets_to_close_its_server_still_ends(bus: BusConfig) -> None:
@@ -57,7 +57,7 @@ def test_a_program_that_forgets_to_close_its_server_still_ends(bus: BusConfig) -
         "from hal.bus.session import BusConfig; from sim_twin.model.scene import SceneConfig; "
         "from sim_twin.ground_truth import TruthClient, TruthServer; from sim_twin.model.world import World; "
         f"bus = BusConfig(port={bus.port}); server = TruthServer(bus, World(SceneConfig())); "
-        "client = TruthClient(bus); print(client.truth().object)"
+        "client = TruthClient(bus); print(client.read().object)"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=True)
     assert done.stdout.strip() == "bottle"

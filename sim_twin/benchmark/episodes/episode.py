@@ -1,4 +1,4 @@
-"""One scenario, seen once, decided and executed by each method in turn: a row a method."""
+"""One scenario, observed once, planned and executed by each method in turn: one row per method."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from z1_runtime.tasks.grasp_selection import GraspSelector, StageTimes
 from z1_runtime.types import Rejection
 
 MakeDecider = Callable[[Scenario, int], GraspSelector]
-"""Returns the runtime's decider for a scenario, with the generator's seed set to the second argument."""
+"""Return the runtime's grasp selector for a scenario, with the generator's seed set to the second argument."""
 
 
 def run_scenario(
@@ -39,24 +39,24 @@ def run_scenario(
     """Return one row for each of `methods`, all on the same first frame and the same candidates.
 
     Args:
-        scenario: what stands where.
-        methods: how candidates are ordered.
+        scenario: what is_stable where.
+        methods: orders of the candidates.
         make_grasp_selector: called once for each attempt.
-        top_k: candidates that may be executed; after a failure the scene is looked at again, as it then is.
-        recordings: which episodes are written for Rerun too.
+        top_k: candidates that may be executed; after a failure the scene as it then is is captured again.
+        recordings: the episodes to record for Rerun too.
     """
     decider = make_grasp_selector(scenario, scenario.draw_seed)  # settings that cannot be used end the run here
     try:
-        seen = _observe_first(scenario, decider)
+        shared = _observe_first(scenario, decider)
     except Exception as error:  # one scenario's defect must not cost the run the others
         return [make_error_row(scenario, method.name, error, top_k=top_k) for method in methods]
     rows = []
     for method in methods:
         try:
             row = (
-                make_row(scenario, method.name, [seen], top_k=top_k)
-                if isinstance(seen, Attempt)
-                else _run_method(scenario, method, make_grasp_selector, seen, top_k=top_k, recordings=recordings)
+                make_row(scenario, method.name, [shared], top_k=top_k)
+                if isinstance(shared, Attempt)
+                else _run_method(scenario, method, make_grasp_selector, shared, top_k=top_k, recordings=recordings)
             )
         except Exception as error:  # as above: the row keeps type, text and traceback
             row = make_error_row(scenario, method.name, error, top_k=top_k)
@@ -65,16 +65,16 @@ def run_scenario(
 
 
 def record_scenario(scenario: Scenario, method: Method, make_grasp_selector: MakeDecider, folder: Path) -> Path | None:
-    """Write what `method` sees, ranks and chooses at its first capture as <scenario>-<method>.rrd in `folder`.
+    """Write observation, ranking and plan of the first attempt of `method` as <scenario>-<method>.rrd in `folder`.
 
     Returns:
-        The file, or None where nothing is seen.
+        The file, or None where nothing is detected.
     """
     decider = make_grasp_selector(scenario, scenario.draw_seed)
-    seen = _observe_first(scenario, decider)
-    if isinstance(seen, Attempt):
+    shared = _observe_first(scenario, decider)
+    if isinstance(shared, Attempt):
         return None
-    return record(folder / recording_name(scenario, method), _decide(method, decider, seen))
+    return record(folder / recording_name(scenario, method), _decide(method, decider, shared))
 
 
 def recording_name(scenario: Scenario, method: Method) -> str:
@@ -83,7 +83,7 @@ def recording_name(scenario: Scenario, method: Method) -> str:
 
 
 def _observe_first(scenario: Scenario, decider: GraspSelector) -> SharedObservation | Attempt:
-    """Return what is seen from home, or the attempt that ended with the look."""
+    """Return the observation from home, or the attempt that ended with it."""
     frame, q = capture(scenario.scene())
     return _observe(scenario, decider, frame, q)
 
@@ -106,13 +106,13 @@ def _run_method(
     scenario: Scenario,
     method: Method,
     make_grasp_selector: MakeDecider,
-    seen: SharedObservation,
+    shared: SharedObservation,
     *,
     top_k: int,
     recordings: Recordings | None,
 ) -> Row:
     decider = make_grasp_selector(scenario, scenario.draw_seed)
-    first = _decide(method, decider, seen)
+    first = _decide(method, decider, shared)
     attempts, given_up, qpos = [first], "", None
     if first.plan is not None:
         with EpisodeRobot(scenario.scene(), decider.kinematics, decider.config.speed) as robot:
@@ -133,8 +133,7 @@ def _execute_attempts(
     *,
     top_k: int,
 ) -> tuple[list[Attempt], str]:
-    """Execute `first` and, after a failure, what is decided on another capture; return all attempts and why it was left
-    at them."""
+    """Execute `first` and, after a failure, plans of new observations; return all attempts and why there are no more."""
     attempt = first
     attempts: list[Attempt] = []
     while True:
@@ -147,7 +146,7 @@ def _execute_attempts(
         try:
             robot.withdraw(attempt.plan, outcome, decider.config.jaw_home)
             if len(attempts) == 1:
-                robot.capture()  # this robot's first frame would have the noise of the episode's first look
+                robot.capture()  # this robot's first frame would have the noise of the episode's first frame
             found = _observe(scenario, decider, *robot.capture())
         except (MotionError, HalError) as error:
             return attempts, f"{Mode.STOPPED.value}: {error}"
@@ -156,36 +155,36 @@ def _execute_attempts(
             return attempts, f"{attempt.ended.mode.value}: {attempt.ended.detail}"
 
 
-def _decide(method: Method, decider: GraspSelector, seen: SharedObservation) -> Attempt:
-    """Return the attempt that `method` would make; without a plan where there is none."""
+def _decide(method: Method, decider: GraspSelector, shared: SharedObservation) -> Attempt:
+    """Return the attempt of `method`; without a plan where there is none."""
     times = StageTimes()
-    times.ms |= seen.times.ms
+    times.ms |= shared.times.ms
     ranked = left = None
     try:
-        ranked, left = method.order(seen, decider, times)
-        plan = decider.planner.plan(ranked.grasps, seen.observation, seen.q, times.stage)
+        ranked, left = method.order(shared, decider, times)
+        plan = decider.planner.plan(ranked.grasps, shared.observation, shared.q, times.stage)
     except (DegenerateCloudError, NoPlanError) as error:
         rejections = error.rejections if isinstance(error, NoPlanError) else ()
         outcome = Outcome(mode=_why_no_plan(rejections), detail=str(error))
-        attempt = Attempt(times=times, outcome=outcome, seen=seen, ranked=ranked, left=left, rejections=rejections)
+        attempt = Attempt(times=times, outcome=outcome, shared=shared, ranked=ranked, left=left, rejections=rejections)
     else:
-        attempt = Attempt(times=times, seen=seen, ranked=ranked, left=left, plan=plan, rejections=plan.rejections)
+        attempt = Attempt(times=times, shared=shared, ranked=ranked, left=left, plan=plan, rejections=plan.rejections)
     return replace(attempt, features=_features(attempt, decider))
 
 
 def _features(attempt: Attempt, decider: GraspSelector) -> np.ndarray | None:
-    """Return what a scoring head would go by (see `Attempt.features`), where something was ranked."""
-    if not attempt.ranked or attempt.seen is None:
+    """Return the features of a scoring head (see `Attempt.features`), if there are ranked candidates."""
+    if not attempt.ranked or attempt.shared is None:
         return None
     of = [0, 0 if attempt.plan is None else attempt.plan.rank]
     try:
-        return decider.planner.features(attempt.ranked.grasps[np.array(of)], attempt.seen.observation)
+        return decider.planner.features(attempt.ranked.grasps[np.array(of)], attempt.shared.observation)
     except DegenerateCloudError:  # a method that fits no box goes on without one
         return None
 
 
 def _why_no_plan(rejections: Sequence[Rejection]) -> Mode:
-    """Return the stage at which the candidate that came furthest was refused."""
+    """Return the stage of the rejection of the candidate that came furthest."""
     reasons = {rejection.reason for rejection in rejections}
     if "path" in reasons or "self" in reasons:
         return Mode.NO_PATH

@@ -1,4 +1,4 @@
-"""What all methods share of one look at a scene: they rank the very same candidates."""
+"""One observation of a scene, shared by all methods: they rank the same candidates."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from z1_runtime.types import Observation
 
 
 class SharedObservation:
-    """A frame, what perception made of it, and what the generator proposed.
+    """A frame with its observation and the generator's candidates.
 
     Args:
         frame: as the camera gave it.
@@ -34,11 +34,11 @@ class SharedObservation:
 
     @classmethod
     def by(cls, decider: GraspSelector, frame: RgbdFrame, q: np.ndarray, times: StageTimes) -> SharedObservation:
-        """Return what `decider` sees in `frame`, taken at joints `q` (7,), and proposes for it; `times` gets the time.
+        """Return observation and candidates of `decider` for `frame`, taken at joints `q` (7,); `times` gets the time.
 
         Raises:
-            PerceptionError: nothing usable was seen.
-            ValueError: the generator can make nothing of the cloud.
+            PerceptionError: nothing usable was detected.
+            ValueError: the generator cannot use the cloud.
         """
         observation = decider.observe(frame, q, times)
         with times.stage("generate"):
@@ -46,9 +46,9 @@ class SharedObservation:
         return cls(frame, q, observation, candidates, times)
 
     def free(self, decider: GraspSelector, times: StageTimes) -> np.ndarray:
-        """Return (N,) which candidates the beak can be laid around without hitting a point that was seen.
+        """Return (N,) which candidates the gripper can be placed on without collision with the observed points.
 
-        It is computed for the first method that asks, and its time is told to each: `times` gets the stage `filter`.
+        The first call computes it; `times` of every call gets its duration as the stage `filter`.
         """
         if self._free is None:
             with self._filter_times.stage("filter"):

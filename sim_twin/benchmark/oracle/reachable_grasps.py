@@ -1,4 +1,4 @@
-"""Ways to grasp an object in a scene that is known exactly, and which of them to try next."""
+"""Reachable grasps of an object in an exactly known scene, and the order to try them in."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from z1_runtime.types import GraspPlan, Observation, Plane
 EXACT_PLANNER = PlannerConfig(
     short_standoff_m=0.04,
     max_branches=8,
-    # The jaws' rubber has a friction of 1.0 in the twin, and no side of the object is unseen
+    # The jaws' rubber has a friction of 1.0 in the twin, and no side of the object is occluded
     beak=BeakConfig(unseen_m=0.0, friction=0.8),
     collision=CollisionConfig(
         scene_threshold_m=0.001,
@@ -46,33 +46,33 @@ EXACT_PLANNER = PlannerConfig(
         object_halo_m=0.0,
     ),
 )
-"""The planner's numbers without what they allow for noise, unseen sides and the camera's calibration."""
+"""The planner's numbers without margins for noise, occluded sides and the camera's calibration."""
 
 _SPACING_M = 0.002
 _SIMILAR_RAD, _SIMILAR_M = 0.5, 0.03
-"""Ways that differ by this much in direction, or in place, are alike by 0.6."""
+"""Difference in direction, or in place, at which two grasps have a similarity of 0.6."""
 _DUPLICATE_SIMILARITY = 0.95
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ReachableGrasp:
-    """One grasp, one flip, that the arm can go."""
+    """One grasp, one flip, that the arm can reach."""
 
-    way: GripperPlacement
+    placement: GripperPlacement
     width_m: float
     jaw_contact: float
-    """Mover angle at which it is touched [rad]."""
+    """Jaw angle at contact [rad]."""
 
 
 class GraspQueue:
-    """Ways of one scene; hands out the best of those least like what failed.
+    """Reachable grasps of one scene, ordered by value and by dissimilarity to the failed ones.
 
     Args:
-        options: what can be gone.
-        worth: (N,) how well each should hold, in [0, 1].
-        n_candidates: grasps they were found among.
-        n_clear: those of them with room for the gripper.
-        rejected: why the others are out, by reason.
+        options: the reachable grasps.
+        worth: (N,) expected quality of each, in [0, 1].
+        n_candidates: grasps of the sweep.
+        n_clear: those of them with clearance for the gripper.
+        rejected: rejections of the others, by reason.
     """
 
     def __init__(
@@ -86,7 +86,7 @@ class GraspQueue:
     ) -> None:
         self._grasps, self._value = find_grasps, value
         self.n_candidates, self.n_clear, self.rejected = n_candidates, n_clear, rejected
-        self._descriptor = np.array([_descriptor(option.way) for option in find_grasps]).reshape(-1, 9)
+        self._descriptor = np.array([_descriptor(grasp.placement) for grasp in find_grasps]).reshape(-1, 9)
         self._novelty, self._nearest = np.ones(len(find_grasps)), np.zeros(len(find_grasps))
         self._failed: list[np.ndarray] = []
 
@@ -94,18 +94,18 @@ class GraspQueue:
         return len(self._grasps)
 
     def next(self) -> ReachableGrasp | None:
-        """Return the one to try next, or None when all that is left are copies of what failed."""
+        """Return the next grasp to try, or None when only copies of failed ones remain."""
         value = np.where(self._nearest < _DUPLICATE_SIMILARITY, self._value + self._novelty, -np.inf)
         if not len(value) or not np.isfinite(value.max()):
             return None
         return self._grasps[int(value.argmax())]
 
-    def add_failure(self, option: ReachableGrasp) -> None:
-        """Set back `option` and all that is like it."""
-        self._add_failure(_descriptor(option.way))
+    def add_failure(self, grasp: ReachableGrasp) -> None:
+        """Lower the value of `grasp` and of similar ones."""
+        self._add_failure(_descriptor(grasp.placement))
 
     def with_failures(self, others: GraspQueue) -> GraspQueue:
-        """Return `others` with the failures known here."""
+        """Return `others` with the failures of this queue."""
         for traits in self._failed:
             others._add_failure(traits)
         return others
@@ -120,14 +120,14 @@ class GraspQueue:
         self._novelty *= 1.0 - similarity
 
 
-def _descriptor(way: GripperPlacement) -> np.ndarray:
-    """Return what makes a way another: approach, the jaws' axis, and where the pads press (9,)."""
-    T = way.T_base_grasp
-    return np.concatenate([T[:3, 2], way.T_base_pivot[:3, 1], T[:3, 3]])
+def _descriptor(placement: GripperPlacement) -> np.ndarray:
+    """Return the descriptor (9,) of a placement: approach, the jaws' axis, and the place of the pads."""
+    T = placement.T_base_grasp
+    return np.concatenate([T[:3, 2], placement.T_base_pivot[:3, 1], T[:3, 3]])
 
 
 class GroundTruthScene:
-    """What stands in a scene, as the planner's checks want it: whole surfaces in the base frame, without noise.
+    """Exact scene for the planner's checks: whole surfaces in the base frame, without noise.
 
     Args:
         scene: the twin's.
@@ -141,7 +141,7 @@ class GroundTruthScene:
         width_estimation.warm_up()
         self.kinematics = kinematics
         self._planner = planner
-        self._surface, self._T_base_object = Surface(scene.thing), scene.T_base_object()
+        self._surface, self._T_base_object = Surface(scene.grasp_object), scene.T_base_object()
         self._middle = self._T_base_object[:3, 3]
         self._gripper = BeakGripper(planner.beak)
         q_home = np.append(z1.Q_HOME, GRIPPER_START_RAD)
@@ -156,7 +156,7 @@ class GroundTruthScene:
         )
 
     def find_grasps(self, sweep: SweepConfig) -> GraspQueue:
-        """Return the ways that hit nothing and that the arm can go, of the grasps of `sweep`."""
+        """Return the collision-free grasps of `sweep` that the arm can reach."""
         planner = self._planner
         grasps = sweep_grasps(self._surface, self._T_base_object, planner.beak.contact_depth_m, sweep)
         candidates = GraspCandidates(
@@ -176,12 +176,14 @@ class GroundTruthScene:
                 rejected[ways.reason] += 1
                 continue
             n_clear += 1
-            gone = [(way, ease) for way in ways if (ease := ranking.ease(way))]
-            rejected["ik"] += not gone
-            for way, ease in gone:
+            reachable = [(placement, ease) for placement in ways if (ease := ranking.ease(placement))]
+            rejected["ik"] += not reachable
+            for placement, ease in reachable:
                 found.append(
                     ReachableGrasp(
-                        way=way, width_m=float(candidates.widths_m[rank]), jaw_contact=candidates.jaw_contact(rank)
+                        placement=placement,
+                        width_m=float(candidates.widths_m[rank]),
+                        jaw_contact=candidates.jaw_contact(rank),
                     )
                 )
                 ranks.append(rank)
@@ -195,20 +197,20 @@ class GroundTruthScene:
             rejected=rejected,
         )
 
-    def plan(self, option: ReachableGrasp) -> GraspPlan:
-        """Return the whole motion of `option`.
+    def plan(self, grasp: ReachableGrasp) -> GraspPlan:
+        """Return the whole motion of `grasp`.
 
         Raises:
-            CandidateRejected: it cannot be gone after all.
+            CandidateRejected: it cannot be reachable after all.
         """
-        way, motion = self._motions.first_motion([option.way])
+        placement, motion = self._motions.first_motion([grasp.placement])
         return GraspPlan(
             rank=0,
-            T_base_grasp=way.T_base_grasp,
-            width_m=option.width_m,
-            T_base_pivot=way.T_base_pivot,
-            jaw_open=way.jaw_open,
-            jaw_contact=option.jaw_contact,
+            T_base_grasp=placement.T_base_grasp,
+            width_m=grasp.width_m,
+            T_base_pivot=placement.T_base_pivot,
+            jaw_open=placement.jaw_open,
+            jaw_contact=grasp.jaw_contact,
             transfer=motion.transfer,
             approach=motion.approach,
             close=motion.close,
@@ -217,7 +219,7 @@ class GroundTruthScene:
         )
 
     def _observation(self, scene: SceneConfig) -> Observation:
-        """Return the scene as if it had been seen from all sides at once; its camera frame is the base frame."""
+        """Return an observation from all sides at once; its camera frame is the base frame."""
         others = [
             transform_points(neighbour.T_base_object(), _sample_evenly(Surface(OBJECTS[neighbour.object])))
             for neighbour in scene.neighbours

@@ -1,7 +1,7 @@
-"""What can be solved at all: grasps swept over the true object, and the best of each kind executed until one holds.
+"""Search for solvable scenarios: grasps swept over the object's true shape, executed until one holds.
 
-The oracle sees no picture: it is told the object's shape and pose. Whatever passes the planner's own checks against the
-true scene is executed in a fresh world, one grasp after the other, each as unlike the failed ones as can be.
+The oracle uses no image: it has the object's true shape and pose. A grasp that passes the planner's own checks against the
+true scene is executed in a fresh world, one grasp after the other, each as dissimilar to the failed ones as possible.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ METHOD = "oracle"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OracleConfig:
-    """How long to search."""
+    """Budget and sweeps of a search."""
 
     executions: int = 40
     """Grasps that are executed, each in a fresh world, before a scenario counts as not solved."""
@@ -38,7 +38,7 @@ class OracleConfig:
     finer_after: int = 12
     """Failed executions after which the finer sweep is made."""
     sweep: SweepConfig = field(default_factory=SweepConfig)
-    """The sweep that is counted, and tried first."""
+    """The first sweep, whose grasps are counted."""
     finer: SweepConfig = field(
         default_factory=lambda: SweepConfig(
             n_points=900, n_approaches=24, depths_m=(0.0, 0.008), cell_m=0.010, cell_sine=0.3, seed=1
@@ -46,15 +46,16 @@ class OracleConfig:
     )
     """The sweep that follows where all of the first fails."""
     planner: PlannerConfig = EXACT_PLANNER
-    """What is a collision where everything is known exactly."""
+    """Planner settings for an exactly known scene."""
     speed: float = 0.5
     """Fraction of the arm's limits that motions use."""
 
     def __post_init__(self) -> None:
         if min(self.executions, self.plannings, self.finer_after) < 1:
             raise InvalidValueError(
-                "executions, plannings and finer_after are "
-                f"{self.executions}, {self.plannings} and {self.finer_after}; each must be 1 or more."
+                f"oracle: executions, plannings or finer_after is out of range ({self.executions}, {self.plannings} and "
+                f"{self.finer_after}, allowed 1 or more). Raise the budget.",
+                code="oracle_budget",
             )
 
 
@@ -72,12 +73,12 @@ def run_oracle_task(task: OracleTask) -> list[Row]:
 
 
 def search(scenario: Scenario, config: OracleConfig) -> Row:
-    """Look for a grasp that lifts the object of `scenario`; return what was found, as a table's row.
+    """Search for a grasp that lifts the object of `scenario`; return the result as a table's row.
 
     `success` says whether one did, `verdict` how the search ended: `solved`; `unsolved`, all that was executed failed;
-    `unreachable`, nothing can be executed. `executions` counts, `modes` names them in turn, and what else is told is
-    of the last one. `n_candidates`, `n_clear` and `n_reachable` are of the first sweep: the grasps, those with room for
-    the gripper, and the ways to lay it (two a grasp) that the arm can go.
+    `unreachable`, nothing can be executed. `executions` counts, `modes` names them in turn, and the other figures
+    are of the last one. `n_candidates`, `n_clear` and `n_reachable` are of the first sweep: the grasps, those with clearance for
+    the gripper, and the reachable placements (two per grasp).
     """
     watch = Stopwatch()
     search_run = _Search(scenario, config)
@@ -134,7 +135,7 @@ class _Search:
         return outcome
 
     def report(self) -> Row:
-        """Return what was found as columns."""
+        """Return the result as columns."""
         counted = self._counted
         assert counted is not None, "nothing was searched"
         success = bool(self._modes) and self._modes[-1] is Mode.SUCCESS

@@ -1,4 +1,4 @@
-"""An object's true surface: points with normals on all its sides, and the chords that run through it."""
+"""An object's true surface: points with normals on all its sides, and the chords through it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _SAME_M = 1e-6
 
 
 class Contacts(NamedTuple):
-    """Where N pads could press, in the object's frame."""
+    """N possible contacts of a pad, in the object's frame."""
 
     points: np.ndarray
     """(N, 3) [m]."""
@@ -61,14 +61,14 @@ class _Hull:
 
 
 class Surface:
-    """The outside of an object that is made of convex parts.
+    """Outer surface of an object made of convex parts.
 
     Args:
         thing: the object.
     """
 
-    def __init__(self, thing: GraspObject) -> None:
-        self._hulls = [_Hull.from_corners(part.corners()) for part in thing.parts]
+    def __init__(self, grasp_object: GraspObject) -> None:
+        self._hulls = [_Hull.from_corners(part.corners()) for part in grasp_object.parts]
 
     def sample(self, spacing_m: float, seed: int = 0) -> Contacts:
         """Return points spread at random over the whole outside, one for each `spacing_m` × `spacing_m` [m]."""
@@ -89,7 +89,7 @@ class Surface:
         return Contacts(np.concatenate(points), np.concatenate(normals))
 
     def trace_chords(self, origins: np.ndarray, directions: np.ndarray) -> tuple[Contacts, Contacts]:
-        """Return where rays that start on the surface and go inwards come out: of the first wall, and for good.
+        """Return where rays that start on the surface and go inwards come out: of the first wall, and of the last.
 
         Args:
             origins: (N, 3) [m].

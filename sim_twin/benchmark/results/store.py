@@ -1,8 +1,8 @@
-"""Rows on disk: a folder of small Parquet files, one a scenario, that any Parquet reader takes for one table.
+"""Rows on disk: a folder of small Parquet files, one per scenario, that Parquet readers read as one table.
 
-A Parquet file cannot be appended to, and one that was half written cannot be read. So each scenario's rows go into a
-file of their own, which appears under its name only when it is whole: a run that is killed loses the scenarios in
-flight and nothing else, and `--resume` goes on with those that are missing.
+A Parquet file cannot be appended to, and a partial one cannot be read. So each scenario's rows go into a file of their
+own, which appears under its name once complete: a killed run loses only the scenarios in flight, and `--resume`
+continues with the missing ones.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class Store:
     """The rows of one run, in `out`.
 
     Raises:
-        FileExistsError: there are rows already and `resume` is False.
+        OutputExistsError: there are rows already and `resume` is False.
     """
 
     def __init__(self, out: Path, resume: bool) -> None:
@@ -35,14 +35,14 @@ class Store:
         self._errors = out / ERROR_LOG
         if not resume and any(self._folder.glob("*.parquet")):
             raise OutputExistsError(
-                f"{out} holds the episodes of an earlier run; add --resume to go on with it, or give another --out."
+                f"store: {out} has the episodes of an earlier run. Add --resume to continue it, or give another --out."
             )
         self._folder.mkdir(parents=True, exist_ok=True)
         for partial in self._folder.glob("*.partial"):
             partial.unlink()
 
     def done(self) -> set[tuple[str, str]]:
-        """Return which (scenario, method) pairs have a row."""
+        """Return the (scenario, method) pairs with a row."""
         return {(row["scenario"], row["method"]) for row in self.rows([])}
 
     def add(self, rows: Iterable[Row]) -> None:
@@ -58,7 +58,7 @@ class Store:
             methods = hashlib.sha256(methods.encode()).hexdigest()[:16]
         path = self._folder / f"{rows[0]['scenario']}-{methods}.parquet"
         partial = path.with_suffix(".partial")
-        pq.write_table(pa.Table.from_pylist(_even(rows)), partial)
+        pq.write_table(pa.Table.from_pylist(_align_columns(rows)), partial)
         with partial.open("rb") as file:
             os.fsync(file.fileno())
         partial.replace(path)
@@ -73,7 +73,7 @@ class Store:
         """Return all rows, sorted by scenario and method; columns that a row lacks are None.
 
         Args:
-            columns: what is wanted besides scenario and method; None is all.
+            columns: in addition to scenario and method; None is all.
         """
         if columns is not None:
             columns = ["scenario", "method", *columns]
@@ -84,14 +84,14 @@ class Store:
         return sorted(rows, key=lambda row: (row["scenario"], row["method"]))
 
     def write_table(self) -> Path:
-        """Write all rows as one file beside the folder and return its path."""
+        """Write all rows as one file next to the folder and return its path."""
         partial = self._table.with_suffix(".partial")
-        pq.write_table(pa.Table.from_pylist(_even(self.rows())), partial)
+        pq.write_table(pa.Table.from_pylist(_align_columns(self.rows())), partial)
         partial.replace(self._table)
         return self._table
 
 
-def _even(rows: list[Row]) -> list[Row]:
+def _align_columns(rows: list[Row]) -> list[Row]:
     """Return `rows` with the same columns in each."""
     names = list(dict.fromkeys(name for row in rows for name in row))
     return [{name: row.get(name) for name in names} for row in rows]

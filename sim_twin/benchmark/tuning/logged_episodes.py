@@ -19,7 +19,7 @@ from z1_runtime.config import RuntimeConfig, config_from
 from z1_runtime.grasping.features import FEATURES
 
 Reading = Literal["top1", "fallthrough"]
-"""`top1`: the first-ranked grasp counts single_feature_auc; `fallthrough`: the first that the arm can do is executed."""
+"""`top1`: only the first-ranked grasp counts; `fallthrough`: the first reachable one is executed."""
 Outcomes = dict[str, dict[str, bool]]
 """Success by method and scenario."""
 

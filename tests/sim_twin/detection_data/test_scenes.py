@@ -81,7 +81,7 @@ def test_an_empty_scene_has_no_labels(renderer: SceneRenderer) -> None:
 def test_a_scenario_has_the_mask_that_the_twin_has(renderer: SceneRenderer, name: str) -> None:
     config = SceneConfig(object=name, distance_m=0.48, lateral_m=-0.15, pitch_deg=45.0)
     pose = config.T_base_object()
-    picture = draw_scenario(renderer, name, pose, np.random.default_rng(0), look="any")
+    picture = draw_scenario(renderer, name, pose, np.random.default_rng(0), appearance="any")
     world = World(config)
     data = world.snapshot()
     quat = np.empty(4)
@@ -96,16 +96,19 @@ def test_a_scenario_has_the_mask_that_the_twin_has(renderer: SceneRenderer, name
 
 
 @needs_egl
-@pytest.mark.parametrize("look", get_args(Appearance))
-def test_an_object_has_its_own_colours_unless_any_will_do(renderer: SceneRenderer, look: Appearance) -> None:
+@pytest.mark.parametrize("appearance", get_args(Appearance))
+def test_an_object_has_its_own_colours_unless_any_will_do(renderer: SceneRenderer, appearance: Appearance) -> None:
     instance, pose = renderer.named("cylinder")[0], SceneConfig(object="cylinder").T_base_object()
     own = [part.rgba for part, _ in instance.prop.parts]
     alike = []
     for seed in range(5):
-        assert draw_scenario(renderer, "cylinder", pose, np.random.default_rng(seed), look=look).look == look
+        assert (
+            draw_scenario(renderer, "cylinder", pose, np.random.default_rng(seed), appearance=appearance).appearance
+            == appearance
+        )
         untextured = (renderer.model.geom_matid[instance.geoms] < 0).all()
         alike.append(untextured and np.allclose(renderer.model.geom_rgba[instance.geoms], own))
-    assert any(alike) == all(alike) == (look != "any")
+    assert any(alike) == all(alike) == (appearance != "any")
 
 
 @needs_egl

@@ -29,15 +29,15 @@ def bracket() -> trimesh.Trimesh:
 
 @pytest.mark.parametrize("suffix", [".stl", ".obj", ".ply"])
 def test_a_concave_mesh_keeps_its_size_mass_and_hollow(tmp_path, suffix):
-    name, thing = load_mesh_object(write(tmp_path / f"bracket{suffix}", bracket()), 1e-3, 0.15)
+    name, grasp_object = load_mesh_object(write(tmp_path / f"bracket{suffix}", bracket()), 1e-3, 0.15)
     assert name.startswith("bracket-")
-    np.testing.assert_allclose(np.ptp(thing.corners(), axis=0), [0.060, 0.040, 0.090], atol=2e-3)
-    np.testing.assert_allclose(thing.corners().min(axis=0), -thing.corners().max(axis=0), atol=1e-9)
-    assert thing.mass_kg == pytest.approx(0.15)
-    assert len(thing.parts) > 1
-    assert thing.stands
+    np.testing.assert_allclose(np.ptp(grasp_object.corners(), axis=0), [0.060, 0.040, 0.090], atol=2e-3)
+    np.testing.assert_allclose(grasp_object.corners().min(axis=0), -grasp_object.corners().max(axis=0), atol=1e-9)
+    assert grasp_object.mass_kg == pytest.approx(0.15)
+    assert len(grasp_object.parts) > 1
+    assert grasp_object.is_stable
     in_the_corner = np.array([0.020, 0.0, 0.030])
-    assert not any(_is_inside(part.corners(), in_the_corner) for part in thing.parts)
+    assert not any(_is_inside(part.corners(), in_the_corner) for part in grasp_object.parts)
 
 
 def _is_inside(corners: np.ndarray, point: np.ndarray) -> bool:
@@ -46,11 +46,11 @@ def _is_inside(corners: np.ndarray, point: np.ndarray) -> bool:
 
 
 def test_it_stands_in_the_scene_on_its_lowest_point_and_stays(tmp_path):
-    name, thing = load_mesh_object(write(tmp_path / "bracket.stl", bracket()), 1e-3, 0.15)
+    name, grasp_object = load_mesh_object(write(tmp_path / "bracket.stl", bracket()), 1e-3, 0.15)
     for pitch_deg in (0.0, 45.0):
-        scene = SceneConfig(object=name, shape=thing, pitch_deg=pitch_deg)
+        scene = SceneConfig(object=name, shape=grasp_object, pitch_deg=pitch_deg)
         pose = scene.T_base_object()
-        assert (thing.corners() @ pose[:3, :3].T + pose[:3, 3])[:, 2].min() == pytest.approx(0.0, abs=1e-12)
+        assert (grasp_object.corners() @ pose[:3, :3].T + pose[:3, 3])[:, 2].min() == pytest.approx(0.0, abs=1e-12)
         world = World(scene)
         world.advance_to(0.5)
         np.testing.assert_allclose(world.T_base_object()[:3, 3], pose[:3, 3], atol=2e-3)
@@ -61,18 +61,18 @@ def test_an_open_surface_is_taken_as_filled(tmp_path):
     tube = trimesh.creation.cylinder(0.03, height=0.08, sections=16)
     tube.update_faces(tube.face_normals[:, 2] < 0.9)
     assert not tube.is_watertight
-    _, thing = load_mesh_object(write(tmp_path / "open.ply", tube), 1.0, 0.1)
-    np.testing.assert_allclose(np.ptp(thing.corners(), axis=0), [0.06, 0.06, 0.08], atol=1e-3)
-    assert any(_is_inside(part.corners(), np.array([0.005, 0.0, 0.02])) for part in thing.parts)
+    _, grasp_object = load_mesh_object(write(tmp_path / "open.ply", tube), 1.0, 0.1)
+    np.testing.assert_allclose(np.ptp(grasp_object.corners(), axis=0), [0.06, 0.06, 0.08], atol=1e-3)
+    assert any(_is_inside(part.corners(), np.array([0.005, 0.0, 0.02])) for part in grasp_object.parts)
 
 
 def test_what_cannot_stand_is_held(tmp_path):
     ball = trimesh.creation.icosphere(subdivisions=3, radius=0.03)
     top = trimesh.creation.cone(radius=0.03, height=0.08, transform=np.diag([1.0, -1.0, -1.0, 1.0]))
     for mesh in (ball, top):
-        name, thing = load_mesh_object(write(tmp_path / "thing.stl", mesh), 1.0, 0.1)
-        assert not thing.stands
-        assert World(SceneConfig(object=name, shape=thing)).fixture_holds
+        name, grasp_object = load_mesh_object(write(tmp_path / "thing.stl", mesh), 1.0, 0.1)
+        assert not grasp_object.is_stable
+        assert World(SceneConfig(object=name, shape=grasp_object)).fixture_holds
 
 
 def test_the_second_time_nothing_is_decomposed(tmp_path, monkeypatch):
@@ -133,8 +133,8 @@ def test_what_is_no_mesh_is_refused(tmp_path):
 
 def test_what_has_a_round_bottom_does_not_stand_though_its_corners_make_feet(tmp_path):
     pill = trimesh.creation.capsule(height=60.0, radius=24.0)
-    _, thing = load_mesh_object(write(tmp_path / "pill.stl", pill), 1e-3, 0.2)
-    assert not thing.stands
+    _, grasp_object = load_mesh_object(write(tmp_path / "pill.stl", pill), 1e-3, 0.2)
+    assert not grasp_object.is_stable
     tin = trimesh.creation.cylinder(24.0, height=108.0, sections=24)
-    _, thing = load_mesh_object(write(tmp_path / "tin.stl", tin), 1e-3, 0.2)
-    assert thing.stands
+    _, grasp_object = load_mesh_object(write(tmp_path / "tin.stl", tin), 1e-3, 0.2)
+    assert grasp_object.is_stable

@@ -45,11 +45,13 @@ def test_it_is_drawn_where_it_stands(world: World) -> None:
 
 
 def test_it_is_as_high_as_it_says_and_its_origin_at_mid_height(world: World) -> None:
-    thing = OBJECTS[world.config.object]
-    heights = thing.corners()[:, 2]
-    np.testing.assert_allclose([heights.min(), heights.max()], [-thing.height_m / 2, thing.height_m / 2], atol=1e-6)
-    assert 0.05 <= thing.mass_kg <= 0.35
-    assert world.model.body("object").mass[0] == pytest.approx(thing.mass_kg)
+    grasp_object = OBJECTS[world.config.object]
+    heights = grasp_object.corners()[:, 2]
+    np.testing.assert_allclose(
+        [heights.min(), heights.max()], [-grasp_object.height_m / 2, grasp_object.height_m / 2], atol=1e-6
+    )
+    assert 0.05 <= grasp_object.mass_kg <= 0.35
+    assert world.model.body("object").mass[0] == pytest.approx(grasp_object.mass_kg)
 
 
 def test_a_turned_part_weighs_by_its_volume() -> None:

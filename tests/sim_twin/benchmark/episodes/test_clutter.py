@@ -22,9 +22,9 @@ CLUTTERED = Scenario(object="cylinder", distance="mid", lateral="left", pitch_de
 def footprint(scene):
     """Return where (2,) each thing stands and how far it reaches from there [m], the object first."""
     pose = scene.T_base_object()
-    things = [(pose, scene.thing)]
+    things = [(pose, scene.grasp_object)]
     things += [(neighbour.T_base_object(), OBJECTS[neighbour.object]) for neighbour in scene.neighbours]
-    return [(T[:2, 3], np.hypot(*(thing.corners() @ T[:3, :3].T)[:, :2].T).max()) for T, thing in things]
+    return [(T[:2, 3], np.hypot(*(grasp_object.corners() @ T[:3, :3].T)[:, :2].T).max()) for T, grasp_object in things]
 
 
 @pytest.mark.parametrize("count", [1, 2, 3])
@@ -112,10 +112,10 @@ def test_an_object_of_no_class_is_seen_as_the_user_chose_or_by_its_rising_above_
 
 
 def test_a_box_counts_where_there_is_no_mask():
-    truth = np.zeros((10, 10), dtype=bool)
-    truth[2:6, 4:8] = True
-    assert compute_iou(Detection(label="x", confidence=1.0, box_px=(4, 2, 8, 6)), truth) == 1.0
-    assert compute_iou(Detection(label="x", confidence=1.0, box_px=(4, 2, 8, 4)), truth) == 0.5
+    ground_truth = np.zeros((10, 10), dtype=bool)
+    ground_truth[2:6, 4:8] = True
+    assert compute_iou(Detection(label="x", confidence=1.0, box_px=(4, 2, 8, 6)), ground_truth) == 1.0
+    assert compute_iou(Detection(label="x", confidence=1.0, box_px=(4, 2, 8, 4)), ground_truth) == 0.5
 
 
 def test_a_neighbour_that_does_not_exist_is_refused():
