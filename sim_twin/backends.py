@@ -185,8 +185,8 @@ class TwinCamera:
         if due_s > now_s + timeout_s:
             self.clock.sleep_until(now_s + timeout_s)
             raise HalTimeoutError(
-                f"twin camera: no frame within the timeout ({timeout_s:g} s, allowed 0.04 s or more). Wait longer: it has 30 "
-                "frames a second."
+                f"twin camera: no frame within the timeout ({timeout_s:g} s, allowed 0.04 s or more). Wait longer: "
+                "it has 30 frames a second."
             )
         self.clock.sleep_until(due_s)
         stamp_s = self.clock.now_s()

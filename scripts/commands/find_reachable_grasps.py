@@ -80,8 +80,8 @@ def main(config: Config) -> int:
         scenarios = [s for s in scenarios if not chosen or getattr(s, name) in chosen]
     if not scenarios:
         raise InvalidValueError(
-            f"oracle: no scenario is left (pitches {config.pitches}, allowed -45, 0 and 45, and 0 alone for the extended "
-            "set). Give others.",
+            f"oracle: no scenario is left (pitches {config.pitches}, allowed -45, 0 and 45; extended set: 0). "
+            "Give others.",
             code="no_scenario",
         )
     tasks = [OracleTask(scenario=s, config=search) for s in scenarios if s.key not in done]

@@ -16,7 +16,7 @@ FRAME_PERIOD_S = 1.0 / 30.0
 DEPTH_UNIT_M = 1e-4
 BASELINE_M = 0.018
 MIN_Z_M = 0.070
-"""Nearer than this the stereo has no match at 640×480 (datasheet: 70 mm at 848×480; measured: breaks up below 70 mm)."""
+"""Nearer than this the stereo has no match at 640×480 (datasheet: 70 mm at 848×480; measured: fails below 70 mm)."""
 MAX_Z_M = 6.5535
 """Largest distance that fits 16 bits of 0.1 mm."""
 DISPARITY_STEP_PX = 1.0 / 32.0

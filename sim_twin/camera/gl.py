@@ -40,7 +40,8 @@ def choose(kind: str | None, with_gl: Callable[[], T], with_rays: Callable[[], T
     kind = kind or os.environ.get(RENDER_VARIABLE) or "auto"
     if kind not in RENDERERS:
         raise InvalidValueError(
-            f"renderer: the kind is unknown ({kind!r}, allowed {', '.join(RENDERERS)}). Set {RENDER_VARIABLE} to one of "
+            f"renderer: the kind is unknown ({kind!r}, allowed {', '.join(RENDERERS)}). Set {RENDER_VARIABLE} to "
+            "one of "
             "these.",
             code="unknown_renderer",
         )

@@ -68,7 +68,7 @@ def _random_view(rng: np.random.Generator) -> np.ndarray:
 
 
 def _choose_target(renderer: SceneRenderer, T_base_camera: np.ndarray, rng: np.random.Generator) -> np.ndarray | None:
-    """Return the point (3,) of a random pixel's ray at mid-height above the table, at a depth of 0.13 to 0.85 m; or None."""
+    """Return the point (3,) of a random pixel's ray at mid-height above the table, 0.13 to 0.85 m deep; or None."""
     i = renderer.intrinsics
     u, v = rng.uniform(0.08, 0.92) * i.width, rng.uniform(0.15, 0.85) * i.height
     ray = T_base_camera[:3, :3] @ i.deproject(np.array([u]), np.array([v]), np.ones(1))[0]

@@ -184,7 +184,7 @@ def visible_ratio(mask: np.ndarray, whole: np.ndarray) -> float:
 def _label_visible(
     renderer: SceneRenderer, objects: list[PropInstance], camera: str, arm: str, *, by_shape: bool
 ) -> tuple[Label, ...]:
-    """Return the visible objects' labels; an object that is too occluded is removed from the scene, and the rest rendered again.
+    """Return the visible objects' labels; too occluded objects are removed, and the rest rendered again.
 
     Args:
         stage: with everything in its place.
@@ -231,7 +231,7 @@ def _is_too_occluded(
 
 
 def _shows_mark(renderer: SceneRenderer, instance: PropInstance, mask: np.ndarray, T_base_camera: np.ndarray) -> bool:
-    """True when the pixels `mask` cover enough of a bottle's or a mug's mark against a cylinder: neck and cap, handle."""
+    """True when the pixels `mask` cover enough of a bottle's or a mug's mark: neck and cap, or handle."""
     corners = _corners_in_base(renderer, instance)
     parts = slice(-2, None) if instance.prop.kind == "bottle" else slice(2, None)
     mark = project_outline(corners[parts], T_base_camera, renderer.intrinsics)

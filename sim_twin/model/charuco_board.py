@@ -55,13 +55,15 @@ class BoardSpec:
         object.__setattr__(self, "image", image)
         if not all(0.02 <= length <= 0.6 for length in self.size_m):
             raise InvalidValueError(
-                f"board: size_m is out of range ({self.size_m}, allowed 0.02 to 0.6 m). Print a board that fits the table.",
+                f"board: size_m is out of range ({self.size_m}, allowed 0.02 to 0.6 m). Print a board that fits "
+                "the table.",
                 code="board_size",
             )
         for name, (low, high) in (("x_m", _X_M), ("y_m", _Y_M)):
             if not low <= getattr(self, name) <= high:
                 raise InvalidValueError(
-                    f"board: {name} is out of reach ({getattr(self, name)}, allowed {low:g} to {high:g} m). Move the board.",
+                    f"board: {name} is out of reach ({getattr(self, name)}, allowed {low:g} to {high:g} m). Move "
+                    "the board.",
                     code="board_position",
                 )
         if not np.isfinite(self.yaw_deg):

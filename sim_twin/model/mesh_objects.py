@@ -107,7 +107,8 @@ def _parse(path: Path, content: bytes) -> trimesh.Trimesh:
         ) from error
     if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
         raise MeshError(
-            f"mesh: {path} has no triangles (0 faces, allowed 1 or more). Export a mesh, not a cloud of points or lines.",
+            f"mesh: {path} has no triangles (0 faces, allowed 1 or more). Export a mesh, not a cloud of points or "
+            "lines.",
             code="mesh_no_faces",
         )
     if not np.isfinite(mesh.vertices).all():
@@ -214,8 +215,8 @@ def _has_feet(parts: tuple[Part, ...], centre: np.ndarray) -> bool:
 
 
 def _stays_upright(grasp_object: GraspObject) -> bool:
-    """Return whether `grasp_object`, put down a little aslant in either direction, still is_stable a second later: a round bottom
-    has feet by its corners, and rolls over all the same."""
+    """Return whether `grasp_object`, put down a little tilted in either direction, is upright a second later: a
+    round bottom has feet by its corners, and rolls over all the same."""
     return all(_settled_tilt_rad(grasp_object, axis) < _UPRIGHT_RAD for axis in np.eye(3)[:2])
 
 

@@ -28,7 +28,7 @@ _PET, _LABEL, _CAP = (0.42, 0.66, 0.80, 1.0), (0.90, 0.92, 0.95, 1.0), (0.10, 0.
 
 _PAPER: dict[str, GraspObject] = {
     # A half-litre bottle, half full: 25 g of PET and 275 g of water, 80 mm high (its part inside the label's
-    # segment is spread over that segment). The water is taken as frozen in place: at grasping accelerations its free surface
+    # segment is spread over that segment). The water is modelled as frozen: at grasping accelerations its free surface
     # moves the centre of mass by a few millimetres.
     "bottle": GraspObject(
         height_m=0.200,
@@ -63,7 +63,7 @@ def add_object(
     name: str = OBJECT_BODY,
     mass_factor: float = 1.0,
 ) -> None:
-    """Add `grasp_object` as a free body called `name` at `T_base_object` (4, 4), `mass_factor` times as heavy as specified."""
+    """Add `grasp_object` as a free body called `name` at `T_base_object` (4, 4), `mass_factor` times its mass."""
     quat = np.empty(4)
     mujoco.mju_mat2Quat(quat, T_base_object[:3, :3].ravel().copy())
     body = spec.worldbody.add_body(name=name, pos=T_base_object[:3, 3], quat=quat)

@@ -115,7 +115,8 @@ class SceneConfig:
             seed = getattr(self, name)
             if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**32:
                 raise InvalidValueError(
-                    f"scene: {name} is invalid ({seed!r}, allowed whole numbers from 0 to {2**32 - 1}). Give such a seed.",
+                    f"scene: {name} is invalid ({seed!r}, allowed whole numbers from 0 to {2**32 - 1}). Give such "
+                    "a seed.",
                     code="scene_seed",
                 )
 

@@ -134,7 +134,7 @@ def _add_joint(body: mujoco.MjsBody, link: _Link, index: int) -> None:
         damping=[link.damping, 0.0, 0.0],
         frictionloss=FRICTIONLOSS[index],
         armature=ARMATURE[index],
-        # Gravity compensation is part of the motor's torque, as in the vendor's controller, and counts towards its limit.
+        # Gravity compensation is part of the motor's torque, as in the vendor's controller, and within its limit.
         actgravcomp=True,
         actfrclimited=True,
         actfrcrange=[-z1.TAU_MAX[index], z1.TAU_MAX[index]],

@@ -49,8 +49,8 @@ def run_tasks_on_ray(tasks: Sequence[Task], address: str) -> Iterator[list[Row]]
         ray.init(address=address, runtime_env=_worker_environment(), log_to_driver=False, logging_level="ERROR")
     except (ConnectionError, ValueError, RuntimeError, TimeoutError) as error:
         raise ClusterError(
-            f"cluster: no Ray cluster answers at {address!r} ({error}). Start one with `ray start --head`, and give its "
-            "HOST:6379, or ray://HOST:10001 from a machine that is no part of it.",
+            f"cluster: no Ray cluster answers at {address!r} ({error}). Start one with `ray start --head`, and give "
+            "its HOST:6379, or ray://HOST:10001 from a machine that is no part of it.",
             code="cluster_unreachable",
         ) from error
     try:
@@ -93,6 +93,7 @@ def _import_ray() -> ModuleType:
         import ray  # pyright: ignore[reportMissingImports] (an extra)
     except ImportError as error:
         raise NoRayError(
-            "cluster: the package ray is not installed (extra `ray`). Run uv sync --inexact --extra ray, then this again."
+            "cluster: the package ray is not installed (extra `ray`). Run uv sync --inexact --extra ray, and "
+            "this again."
         ) from error
     return ray

@@ -133,7 +133,7 @@ def _execute_attempts(
     *,
     top_k: int,
 ) -> tuple[list[Attempt], str]:
-    """Execute `first` and, after a failure, plans of new observations; return all attempts and why there are no more."""
+    """Execute `first` and, after a failure, new plans; return all attempts and why there are no more."""
     attempt = first
     attempts: list[Attempt] = []
     while True:

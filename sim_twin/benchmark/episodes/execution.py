@@ -24,7 +24,7 @@ from z1_runtime.motion.trajectory import MotionLimits, PathFailure, hold, joint_
 from z1_runtime.types import GraspPlan, JointTrajectory
 
 MIN_LIFT_M, MAX_SLIP_M, HOLD_S, CARRY_M = 0.05, 0.02, 1.0, 0.03
-"""Success: at least 50 mm up for 1 s after a lift and a 30 mm sideways move, and less than 20 mm of slip in the jaws."""
+"""Success: at least 50 mm up for 1 s after a lift and a 30 mm sideways move, and under 20 mm of slip in the jaws."""
 _MAX_TABLE_FORCE_N = 5.0
 _FRAME_TIMEOUT_S = 1.0
 
@@ -82,7 +82,7 @@ class Outcome:
 
 
 class EpisodeRobot:
-    """A lock-step arm at home in a scene of its own, with its camera and a monitor of the ground truth; use it with `with`."""
+    """A lock-step arm at home in a scene of its own, with camera and ground-truth monitor; use it with `with`."""
 
     def __init__(self, scene: SceneConfig, kinematics: Kinematics | None = None, speed: float = 0.5) -> None:
         rig = make_rig(scene, lockstep=True)

@@ -169,7 +169,8 @@ def _parse_value(text: str, key: str, value: str) -> object:
     if key == "box":
         if value not in get_args(FitMethod):
             raise InvalidValueError(
-                f"method {text!r}: box is unknown ({value!r}, allowed {', '.join(get_args(FitMethod))}). Give one of these.",
+                f"method {text!r}: box is unknown ({value!r}, allowed {', '.join(get_args(FitMethod))}). "
+                "Give one of these.",
                 code="method_value",
             )
         return value

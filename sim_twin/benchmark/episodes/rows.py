@@ -70,8 +70,8 @@ def make_row(
     Args:
         scenario: `object`, `distance`, …, and the physics and neighbours that were sample for it.
         method: its name.
-        attempts: one or more; `attempts`, `modes` and `ranks` describe each, `success_after` (top_k,) whether the object
-            was lifted within one, two, … of them.
+        attempts: one or more; `attempts`, `modes` and `ranks` describe each, `success_after` (top_k,) whether the
+            object was lifted within one, two, … of them.
         top_k: how many there might have been.
         given_up: why there were no more, if that was not for success or their number.
         qpos: MuJoCo's positions at the end; None where nothing moved.

@@ -55,7 +55,8 @@ class Scenario:
         _check_choice("lateral", self.lateral, tuple(LATERALS_M))
         if not 0.0 <= self.occlusion < 1.0:
             raise InvalidValueError(
-                f"scenario: occlusion is out of range ({self.occlusion!r}, allowed 0 up to, not including, 1). Lower it.",
+                f"scenario: occlusion is out of range ({self.occlusion!r}, allowed 0 up to, not including, 1). "
+                "Lower it.",
                 code="scenario_occlusion",
             )
         if self.seed < 0:
@@ -64,7 +65,8 @@ class Scenario:
             )
         if not 0 <= self.clutter <= MAX_NEIGHBOURS:
             raise InvalidValueError(
-                f"scenario: clutter is out of range ({self.clutter}, allowed 0 to {MAX_NEIGHBOURS} neighbours). Give fewer.",
+                f"scenario: clutter is out of range ({self.clutter}, allowed 0 to {MAX_NEIGHBOURS} neighbours). "
+                "Give fewer.",
                 code="scenario_clutter",
             )
 

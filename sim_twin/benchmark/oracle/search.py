@@ -1,6 +1,6 @@
 """Search for solvable scenarios: grasps swept over the object's true shape, executed until one holds.
 
-The oracle uses no image: it has the object's true shape and pose. A grasp that passes the planner's own checks against the
+The oracle uses no image: it has the object's true shape and pose. A grasp that passes the planner's own checks in the
 true scene is executed in a fresh world, one grasp after the other, each as dissimilar to the failed ones as possible.
 """
 
@@ -53,7 +53,8 @@ class OracleConfig:
     def __post_init__(self) -> None:
         if min(self.executions, self.plannings, self.finer_after) < 1:
             raise InvalidValueError(
-                f"oracle: executions, plannings or finer_after is out of range ({self.executions}, {self.plannings} and "
+                f"oracle: executions, plannings or finer_after is out of range ({self.executions}, "
+                f"{self.plannings} and "
                 f"{self.finer_after}, allowed 1 or more). Raise the budget.",
                 code="oracle_budget",
             )
@@ -77,8 +78,8 @@ def search(scenario: Scenario, config: OracleConfig) -> Row:
 
     `success` says whether one did, `verdict` how the search ended: `solved`; `unsolved`, all that was executed failed;
     `unreachable`, nothing can be executed. `executions` counts, `modes` names them in turn, and the other figures
-    are of the last one. `n_candidates`, `n_clear` and `n_reachable` are of the first sweep: the grasps, those with clearance for
-    the gripper, and the reachable placements (two per grasp).
+    are of the last one. `n_candidates`, `n_clear` and `n_reachable` are of the first sweep: the grasps, those with clearance
+    for the gripper, and the reachable placements (two per grasp).
     """
     watch = Stopwatch()
     search_run = _Search(scenario, config)

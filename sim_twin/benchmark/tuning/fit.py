@@ -159,7 +159,10 @@ def _head_note(wanted: bool, report: HeadReport | None, success: np.ndarray) -> 
     if not wanted:
         return "No head was requested."
     if report is None:
-        return f"No head was fitted: the rows have {grasps}; 10 of either kind are needed. Rows of older versions have none."
+        return (
+            f"No head was fitted: the rows have {grasps}; 10 of either kind are needed. Rows of older versions have "
+            "none."
+        )
     return f"Fitted to {grasps}." + (
         "" if report.beats_base_rate else " It predicts no better than the success rate, so it is not proposed."
     )
