@@ -73,7 +73,7 @@ class BoardSpec:
             )
 
     def T_base_board(self) -> np.ndarray:
-        """Return the board's pose (4, 4): origin at the image's upper left corner, x right, y down, z into the table."""
+        """Return the board's pose (4, 4): origin at the upper left corner, x right, y down, z into the table."""
         yaw = np.deg2rad(self.yaw_deg)
         c, s = np.cos(yaw), np.sin(yaw)
         pose = np.eye(4)

@@ -78,8 +78,8 @@ def search(scenario: Scenario, config: OracleConfig) -> Row:
 
     `success` says whether one did, `verdict` how the search ended: `solved`; `unsolved`, all that was executed failed;
     `unreachable`, nothing can be executed. `executions` counts, `modes` names them in turn, and the other figures
-    are of the last one. `n_candidates`, `n_clear` and `n_reachable` are of the first sweep: the grasps, those with clearance
-    for the gripper, and the reachable placements (two per grasp).
+    are of the last one. `n_candidates`, `n_clear` and `n_reachable` are of the first sweep: the grasps, those with
+    clearance for the gripper, and the reachable placements (two per grasp).
     """
     watch = Stopwatch()
     search_run = _Search(scenario, config)

@@ -5,7 +5,7 @@ from sim_twin.camera.d405 import INTRINSICS
 from sim_twin.camera.render import make_renderer
 from sim_twin.model.more_objects import EXTENDED
 from sim_twin.model.objects import OBJECTS
-from sim_twin.model.parts import make_homogeneous_lathe, wall
+from sim_twin.model.parts import make_homogeneous_lathe, make_wall
 from sim_twin.model.scene import SceneConfig
 from sim_twin.model.world import World
 
@@ -60,7 +60,7 @@ def test_a_turned_part_weighs_by_its_volume() -> None:
 
 
 def test_a_wall_is_hollow_and_has_no_gaps() -> None:
-    staves = wall((0.02, 0.03), (0.02, 0.03), (0.0, 0.1), 0.16, _RGBA)
+    staves = make_wall((0.02, 0.03), (0.02, 0.03), (0.0, 0.1), 0.16, _RGBA)
     assert sum(stave.mass_kg for stave in staves) == pytest.approx(0.16)
     bearings = [np.arctan2(s.corners()[:, 1].mean(), s.corners()[:, 0].mean()) for s in staves]
     np.testing.assert_allclose(np.diff(np.unwrap(bearings)), 2 * np.pi / len(staves))
