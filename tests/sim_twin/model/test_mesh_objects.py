@@ -123,7 +123,7 @@ def test_files_that_are_no_mesh_are_rejected(tmp_path):
     with raises(MeshError, "mesh_no_faces"):
         load_mesh_object(tmp_path / "points.ply", 1.0, 0.1)
     (tmp_path / "broken.stl").write_bytes(b"solid nothing\nfacet normal a b c\n")
-    with raises(MeshError, "mesh_format"):
+    with raises(MeshError, "mesh_no_faces"):
         load_mesh_object(tmp_path / "broken.stl", 1.0, 0.1)
     path = write(tmp_path / "box.stl", trimesh.creation.box((0.06, 0.05, 0.08)))
     with raises(MeshError, "mesh_mass"):
