@@ -11,7 +11,7 @@ from hal.base import z1
 from sim_twin.camera.d405 import INTRINSICS
 from sim_twin.camera.render import make_renderer
 from sim_twin.detection_data.photometric_noise import augment_image
-from sim_twin.detection_data.props import CLASSES, HIDDEN_GROUP, make_class_prop, make_distractor, nominal_prop
+from sim_twin.detection_data.props import CLASSES, UNDRAWN_GROUP, make_class_prop, make_distractor, nominal_prop
 from sim_twin.detection_data.scene_renderer import SceneRenderer
 from sim_twin.detection_data.scenes import (
     MIN_MARK_RATIO,
@@ -156,7 +156,7 @@ def test_a_bottle_without_its_neck_has_no_label_where_colours_tell_nothing(rende
         rng = np.random.default_rng(seed)
         picture = draw_scene(renderer, rng, SceneMix(empty=0.0, twin=0.0, own=0.0, wrist=0.0, occluded=0.0))
         camera = renderer.T_base_camera("free")
-        shown = [a for a in renderer.named("bottle") if renderer.model.geom_group[a.geoms[0]] != HIDDEN_GROUP]
+        shown = [a for a in renderer.named("bottle") if renderer.model.geom_group[a.geoms[0]] != UNDRAWN_GROUP]
         masks = [label.mask for label in picture.labels if label.name == "bottle"]
         for instance, mask in zip(shown, masks, strict=True) if len(shown) == len(masks) == 1 else []:
             pose = renderer.pose(instance)
@@ -262,7 +262,7 @@ def test_every_mug_shows_its_handle(renderer: SceneRenderer) -> None:
                 continue
             number = renderer.props.index(mug)
             whole = renderer.draw_instances("free", "none") == number
-            renderer.model.geom_group[mug.geoms[2:]] = HIDDEN_GROUP
+            renderer.model.geom_group[mug.geoms[2:]] = UNDRAWN_GROUP
             without = renderer.draw_instances("free", "none") == number
             renderer.put(mug, renderer.pose(mug))
             assert (whole & ~without).sum() > 0.04 * whole.sum()

@@ -4,7 +4,7 @@ import pytest
 from hal.base.errors import InvalidValueError
 from sim_twin.benchmark.episodes.execution import EpisodeRobot, Mode, Outcome
 from sim_twin.benchmark.episodes.scenarios import Scenario
-from sim_twin.benchmark.oracle import find_grasps as oracle_options
+from sim_twin.benchmark.oracle import reachable_grasps
 from sim_twin.benchmark.oracle.candidates import SweepConfig, sweep_grasps
 from sim_twin.benchmark.oracle.reachable_grasps import EXACT_PLANNER, GroundTruthScene
 from sim_twin.benchmark.oracle.search import OracleConfig, search
@@ -79,7 +79,7 @@ def test_after_a_failure_what_is_unlike_it_comes_next_and_copies_never(find_gras
 
 def _spread(some):
     """Return the mean distance between the ways of `some`: of directions and, ten times as dear, of metres."""
-    traits = np.array([oracle_options._descriptor(option.way) for option in some]) * np.repeat([1.0, 10.0], [6, 3])
+    traits = np.array([reachable_grasps._descriptor(option.way) for option in some]) * np.repeat([1.0, 10.0], [6, 3])
     return np.linalg.norm(traits[:, None] - traits[None], axis=2).mean()
 
 
