@@ -79,7 +79,7 @@ def test_after_a_failure_what_is_unlike_it_comes_next_and_copies_never(find_gras
 
 def _spread(some):
     """Return the mean distance between the ways of `some`: of directions and, ten times as dear, of metres."""
-    traits = np.array([reachable_grasps._descriptor(option.way) for option in some]) * np.repeat([1.0, 10.0], [6, 3])
+    traits = np.array([reachable_grasps._descriptor(option.placement) for option in some]) * np.repeat([1.0, 10.0], [6, 3])
     return np.linalg.norm(traits[:, None] - traits[None], axis=2).mean()
 
 
@@ -92,7 +92,7 @@ def test_a_finer_sweep_remembers_what_failed(find_grasps):
     assert first.with_failures(again).next() is not None
     following = again.next()
     assert following is not None
-    assert not np.allclose(following.way.T_base_pivot, best.way.T_base_pivot)
+    assert not np.allclose(following.placement.T_base_pivot, best.placement.T_base_pivot)
 
 
 def test_an_upright_box_is_lifted_by_the_first_grasp():
