@@ -78,8 +78,9 @@ def test_after_a_failure_what_is_unlike_it_comes_next_and_copies_never(find_gras
 
 
 def _spread(some):
-    """Return the mean distance between the ways of `some`: of directions and, ten times as dear, of metres."""
-    traits = np.array([reachable_grasps._descriptor(option.placement) for option in some]) * np.repeat([1.0, 10.0], [6, 3])
+    """Return the mean distance between `some` placements: of directions and, weighted tenfold, of metres."""
+    descriptors = [reachable_grasps._descriptor(grasp.placement) for grasp in some]
+    traits = np.array(descriptors) * np.repeat([1.0, 10.0], [6, 3])
     return np.linalg.norm(traits[:, None] - traits[None], axis=2).mean()
 
 
