@@ -1,6 +1,6 @@
 """The twin's arm and camera behind the contracts of `hal`, in this process.
 
-Lock-step: the clock is a `TwinClock`, physics moves only when somebody sleeps on it, and an episode is a pure function
+Lock-step: the clock is a `TwinClock`, physics moves only during a sleep, and an episode is a pure function
 of its seed. Real time: the clock is the wall's, and the 500 Hz servo that reads the arm's state drives the physics.
 """
 
@@ -31,16 +31,16 @@ from sim_twin.model.scene import SceneConfig
 from sim_twin.model.world import World
 
 _MAX_CATCH_UP_S = 0.020
-"""Most simulated time one read may make up; the rest of a delay is dropped, so the world slows and never bursts."""
+"""Maximum simulated time that one read catches up; the rest of a delay is dropped: the world slows, never bursts."""
 
 
 class TwinArm:
     """`hal.base.arm.Arm` of the simulated Z1; moves between threads as the world does (under its lock).
 
-    A setpoint takes effect as many setpoints later as the scene's `arm_latency_s` says; a stop does at once.
+    A setpoint takes effect after the scene's `arm_latency_s`, in whole setpoints; a stop at once.
 
     Args:
-        world: whose arm it is; by default one of its own with the default scene.
+        world: of the arm; by default one of its own with the default scene.
         clock: a `TwinClock` of that world for lock-step (the default), any other for real time.
     """
 
@@ -49,8 +49,8 @@ class TwinArm:
         self.clock: Clock = clock if clock is not None else TwinClock(self.world)
         self._lockstep = isinstance(self.clock, TwinClock)
         self._connected = False
-        self._late = round(self.world.config.arm_latency_s / z1.CONTROL_PERIOD_S)
-        self._on_the_way: deque[tuple[np.ndarray, np.ndarray]] = deque()
+        self._latency_periods = round(self.world.config.arm_latency_s / z1.CONTROL_PERIOD_S)
+        self._pending: deque[tuple[np.ndarray, np.ndarray]] = deque()
         self._offset_s = 0.0  # clock minus world
 
     def connect(self) -> None:
@@ -85,14 +85,14 @@ class TwinArm:
         self._require_connection()
         q = np.clip(setpoint.q, z1.Q_MIN, z1.Q_MAX)
         dq = np.clip(setpoint.dq, -z1.DQ_MAX, z1.DQ_MAX)
-        self._on_the_way.append((q, dq))
-        if len(self._on_the_way) > self._late:
-            self.world.set_command(*self._on_the_way.popleft())
+        self._pending.append((q, dq))
+        if len(self._pending) > self._latency_periods:
+            self.world.set_command(*self._pending.popleft())
         return ArmSetpoint(q=q, dq=dq)
 
     def stop(self) -> None:
         """Hold the position measured now."""
-        self._on_the_way.clear()
+        self._pending.clear()
         q, _, _ = self.world.read_arm()
         self.world.set_command(np.clip(q, z1.Q_MIN, z1.Q_MAX), np.zeros(z1.N_JOINTS))
 
@@ -115,9 +115,9 @@ class TwinCamera:
     Drawing happens in a thread of its own, as an OpenGL context belongs to one thread.
 
     Args:
-        world: what it looks at; by default one of its own with the default scene.
+        world: in view; by default one of its own with the default scene.
         clock: a `TwinClock` of that world for lock-step (the default), any other for real time.
-        renderer: one of `sim_twin.camera.render.RENDERERS`; by default what the environment says.
+        renderer: one of `sim_twin.camera.render.RENDERERS`; by default the environment's.
     """
 
     def __init__(self, world: World | None = None, clock: Clock | None = None, renderer: str | None = None) -> None:
@@ -134,11 +134,11 @@ class TwinCamera:
         """Open the renderer and draw once, so that the first frame is as quick as the others.
 
         Raises:
-            CameraError: the renderer asked for cannot be had.
+            CameraError: the renderer is not available.
         """
         if self._thread is not None:
             return
-        initializer = None if isinstance(self.clock, TwinClock) else give_way
+        initializer = None if isinstance(self.clock, TwinClock) else lower_thread_priority
         thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="twin-camera", initializer=initializer)
         try:
             self._renderer = thread.submit(
@@ -172,7 +172,7 @@ class TwinCamera:
         return d405.INTRINSICS
 
     def wait_for_frame(self, timeout_s: float) -> RgbdFrame:
-        """Wait for the next of the camera's instants, 30 a second, and return what is seen then.
+        """Wait for the next of the camera's instants, 30 a second, and return its frame.
 
         Raises:
             NotConnectedError: before `connect()`.
@@ -180,13 +180,14 @@ class TwinCamera:
         """
         self._require_connection()
         now_s = self.clock.now_s()
-        # The tolerance keeps an instant that rounding puts a hair after its own step from being seen twice.
+        # The tolerance keeps an instant that rounding puts just after its own step from being exposed twice.
         number = math.floor((now_s - self._first_s) / d405.FRAME_PERIOD_S + 1e-6) + 1
         due_s = self._first_s + number * d405.FRAME_PERIOD_S
         if due_s > now_s + timeout_s:
             self.clock.sleep_until(now_s + timeout_s)
             raise HalTimeoutError(
-                f"no frame within {timeout_s:g} s; the twin's camera gives 30 a second: wait at least 0.04 s."
+                f"twin camera: no frame within the timeout ({timeout_s:g} s, allowed 0.04 s or more). Wait longer: "
+                "it has 30 frames a second."
             )
         self.clock.sleep_until(due_s)
         stamp_s = self.clock.now_s()
@@ -203,7 +204,7 @@ class TwinCamera:
         )
 
     def _expose(self, sequence: int) -> View:
-        """Return what the sensor makes of the present scene, worked out in the camera's own thread."""
+        """Return the sensor's image of the present scene, computed in the camera's own thread."""
         thread, renderer = self._thread, self._renderer
         if thread is None or renderer is None:
             raise NotConnectedError("the twin's camera")
@@ -221,7 +222,7 @@ class TwinCamera:
             raise NotConnectedError("the twin's camera")
 
 
-def give_way() -> None:
+def lower_thread_priority() -> None:
     """Lower this thread's priority: software GL and the noise must not keep the servo's thread from its core."""
     if sys.platform == "linux":  # where a priority belongs to a thread
         os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 10)

@@ -1,4 +1,4 @@
-"""The twin's time: it stands still until somebody sleeps on it."""
+"""The twin's time: it advances only while a caller sleeps on it."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class TwinClock:
         return self._world.time_s
 
     def call_every_tick(self, function: Callable[[], None]) -> None:
-        """Call `function` before each control step while somebody sleeps, in the order of registration."""
+        """Call `function` before each control step of a sleep, in the order of registration."""
         self._ticks.append(function)
 
     def sleep_until(self, t_s: float) -> None:

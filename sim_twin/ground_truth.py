@@ -1,4 +1,4 @@
-"""What only the twin knows, over Zenoh and for evaluation alone: where everything really is."""
+"""Ground truth of the twin's scene over Zenoh, for evaluation only."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from hal.bus.session import BusConfig, open_session
 if TYPE_CHECKING:
     from sim_twin.model.scene_view import SceneView
 
-_TRUTH = "eval/truth"
+_KEY = "eval/ground_truth"
 _POSES = ("T_base_object", "T_flange_camera", "T_base_board")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class GroundTruth:
-    """The scene as it really is."""
+    """Exact state of the scene."""
 
     object: str
     """Its name."""
@@ -33,7 +33,7 @@ class GroundTruth:
     lifted_m: float
     """How much higher its lowest point is than at the start [m]."""
     T_flange_camera: np.ndarray
-    """(4, 4) where the camera really is."""
+    """(4, 4) the camera's true pose."""
     T_base_board: np.ndarray | None
     """(4, 4) where the calibration board is (`sim_twin.model.charuco_board.BoardSpec`); None without one."""
     qpos: np.ndarray
@@ -41,7 +41,7 @@ class GroundTruth:
 
 
 def read_ground_truth(world: SceneView) -> GroundTruth:
-    """Return the truth about `world` at this moment."""
+    """Return the ground truth of `world` at this moment."""
     return GroundTruth(
         object=world.config.object,
         T_base_object=world.T_base_object(),
@@ -53,55 +53,59 @@ def read_ground_truth(world: SceneView) -> GroundTruth:
 
 
 class GroundTruthServer:
-    """Answers questions about a world, beside its HAL process, whose link must be open.
+    """Server of a world's ground truth in its HAL process, whose link must be open.
 
-    Pictures are left to the asker: drawing one here would take the interpreter from the servo.
+    Rendering is left to the client: it would take the interpreter from the servo here.
     """
 
     def __init__(self, config: BusConfig, world: SceneView) -> None:
         self._world = world
         self._session = open_session(config, listen=False)
-        self._service = Service(self._session, _TRUTH, self._answer, on_failure=lambda: None)
+        self._service = Service(self._session, _KEY, self._answer, on_failure=lambda: None)
         atexit.register(self.close)  # a program that ends carelessly leaves no thread inside Zenoh
 
     def close(self) -> None:
-        """Answer no more."""
+        """Stop serving."""
         atexit.unregister(self.close)
         self._service.close()
         self._session.close()
 
-    def _answer(self, asker: str, payload: bytes) -> bytes:
-        truth = read_ground_truth(self._world)
+    def _answer(self, client: str, payload: bytes) -> bytes:
+        ground_truth = read_ground_truth(self._world)
         content = {
-            "object": truth.object,
-            "lifted_m": truth.lifted_m,
-            "qpos": truth.qpos.tolist(),
-            **{name: None if (pose := getattr(truth, name)) is None else pose.ravel().tolist() for name in _POSES},
+            "object": ground_truth.object,
+            "lifted_m": ground_truth.lifted_m,
+            "qpos": ground_truth.qpos.tolist(),
+            **{
+                name: None if (pose := getattr(ground_truth, name)) is None else pose.ravel().tolist()
+                for name in _POSES
+            },
         }
         return msgpack.packb(content)  # pyright: ignore[reportReturnType] (its stub is wrong)
 
 
 class GroundTruthClient:
-    """Asks a twin's HAL process.
+    """Client of a twin's HAL process.
 
     Raises:
         HalTimeoutError: no HAL process answers.
     """
 
     def __init__(self, config: BusConfig) -> None:
-        self._link = BusLink(replace(config, request_timeout_s=2.0), WallClock(), "the twin's truth")
+        self._link = BusLink(replace(config, request_timeout_s=2.0), WallClock(), "the twin's ground truth")
 
-    def truth(self) -> GroundTruth:
-        """Return the truth at this moment.
+    def read(self) -> GroundTruth:
+        """Return the ground truth at this moment.
 
         Raises:
             HalTimeoutError: no twin answers, for instance because the HAL drives a real arm.
         """
         try:
-            content = msgpack.unpackb(self._link.request(_TRUTH))
+            content = msgpack.unpackb(self._link.request(_KEY))
         except HalTimeoutError as error:
             raise HalTimeoutError(
-                f"the twin does not answer; only a simulated HAL knows the truth ({error})"
+                f"ground truth: no simulated HAL answers ({error}). Start one with `./z1 hal --hal sim`.",
+                code="no_twin",
             ) from error
         for name in _POSES:
             content[name] = None if content[name] is None else np.array(content[name]).reshape(4, 4)

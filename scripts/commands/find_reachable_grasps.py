@@ -1,9 +1,9 @@
-"""Searches all grasps on the true object, in the true scene, by real physics: which scenarios can be solved at all.
+"""Find the solvable scenarios: grasps all over the object's true shape, executed in the twin until one holds.
 
 ./z1 oracle                              # the paper's 81; some minutes on two cores
 ./z1 oracle --set extended --out out/oracle_extended
 ./z1 oracle --objects bottle --pitches -45 --executions 100
-./z1 oracle --resume --bench out/bench   # and what the methods make of it
+./z1 oracle --resume --bench out/bench   # and the methods' success on the solvable ones
 """
 
 from __future__ import annotations
@@ -31,42 +31,47 @@ from sim_twin.benchmark.results.summary import plain
 
 @dataclass(frozen=True, kw_only=True)
 class Config:
-    """Which scenarios, and how long to look."""
+    """Options of the search."""
 
     set: Literal["paper", "extended"] = "paper"
-    """The paper's objects in 27 poses each, or the further ones, upright, in 9."""
+    """Objects: the paper's in 27 poses each, or the extended set, upright, in 9."""
     objects: tuple[str, ...] = ()
-    """What stands on the table, if not all objects of the set."""
+    """Objects to search; by default all of the set."""
     pitches: tuple[float, ...] = ()
-    """Leans, if not all of them [°]."""
+    """Leans [°]; by default all."""
     distances: tuple[str, ...] = ()
-    """near, mid, far: those, if not all of them."""
+    """Distances: near, mid, far; by default all."""
     laterals: tuple[str, ...] = ()
-    """left, centre, right: those, if not all of them."""
+    """Lateral positions: left, centre, right; by default all."""
     clutter: tuple[int, ...] = (0,)
-    """Numbers of neighbours, 0 to 3, that stand around the object."""
+    """Numbers of neighbours, 0 to 3, around the object."""
     seeds: tuple[int, ...] = (0,)
-    """Of the neighbours; without them all seeds are the same scene."""
+    """Seeds of the neighbours; without neighbours all seeds are the same scene."""
     executions: int = 40
-    """Grasps executed, as unlike each other as can be, before a scenario counts as not solved."""
+    """Grasps executed, as dissimilar as possible, before a scenario counts as not solved."""
     jobs: int = 2
-    """Scenarios side by side, a process each."""
+    """Worker processes."""
     resume: bool = False
-    """Go on with an interrupted run in the same folder."""
+    """Continue an interrupted run in the same folder."""
     bench: Path | None = None
-    """Folder of a benchmark's run: what its methods make of the scenarios that can be solved."""
+    """Folder of a benchmark's run, for its methods' success on the solvable scenarios."""
     out: Path = Path("out/oracle")
     """Folder for episodes/, episodes.parquet, summary.json and report.html."""
 
     def __post_init__(self) -> None:
         if self.jobs < 1:
-            raise InvalidValueError(f"jobs is {self.jobs}; allowed is 1 or more.")
+            raise InvalidValueError(
+                f"oracle: jobs is out of range ({self.jobs}, allowed 1 or more). Give --jobs 1 or more.",
+                code="jobs_range",
+            )
         if self.bench is not None and not (self.bench / TABLE).is_file():
-            raise InvalidValueError(f"{self.bench} holds no {TABLE}; give the folder of a `./z1 bench` run.")
+            raise InvalidValueError(
+                f"oracle: {self.bench} has no {TABLE}. Give the folder of a `./z1 bench` run.", code="no_bench_table"
+            )
 
 
 def main(config: Config) -> int:
-    """Search what is missing, and say what can be solved."""
+    """Search the missing scenarios, and write summary and report."""
     search = replace(OracleConfig(), executions=config.executions)
     store = Store(config.out, config.resume)
     done = {scenario for scenario, _ in store.done()}
@@ -74,7 +79,11 @@ def main(config: Config) -> int:
     for name, chosen in (("pitch_deg", config.pitches), ("distance", config.distances), ("lateral", config.laterals)):
         scenarios = [s for s in scenarios if not chosen or getattr(s, name) in chosen]
     if not scenarios:
-        raise InvalidValueError("no scenario is left; pitches are -45, 0 and 45 (0 alone for the extended set).")
+        raise InvalidValueError(
+            f"oracle: no scenario is left (pitches {config.pitches}, allowed -45, 0 and 45; extended set: 0). "
+            "Give others.",
+            code="no_scenario",
+        )
     tasks = [OracleTask(scenario=s, config=search) for s in scenarios if s.key not in done]
     console = Console(highlight=False)
     try:
@@ -83,9 +92,9 @@ def main(config: Config) -> int:
         if rows := store.rows():
             store.write_table()
             run = {"version": version("z1-grasp"), "command": plain(asdict(config)), "search": asdict(search)}
-            summary = write_summary(rows, config.out / "summary.json", run, _others(config.bench))
+            summary = write_summary(rows, config.out / "summary.json", run, _load_bench_rows(config.bench))
             write_report(rows, summary, config.out / "report.html")
-            _print(console, summary)
+            _print_summary(console, summary)
             console.print(f"rows: {config.out}/episodes.parquet, figures: {config.out}/summary.json and report.html")
     return 0
 
@@ -104,7 +113,7 @@ def _run(tasks: list[OracleTask], jobs: int, store: Store, console: Console) -> 
             progress.update(bar, advance=1, description=f"solved {solved} of {searched}")
 
 
-def _others(folder: Path | None) -> list[Row]:
+def _load_bench_rows(folder: Path | None) -> list[Row]:
     """Return the episodes of a benchmark's run."""
     if folder is None:
         return []
@@ -113,10 +122,10 @@ def _others(folder: Path | None) -> list[Row]:
     return [row for row in pq.read_table(folder / TABLE).to_pylist() if row["method"] != METHOD]
 
 
-def _print(console: Console, summary: dict[str, Any]) -> None:
+def _print_summary(console: Console, summary: dict[str, Any]) -> None:
     table = Table("object", "scenarios", "solved")
-    for name, tally in summary["by"]["object"].items():
-        table.add_row(name, str(tally["episodes"]), str(tally["solved"]))
+    for name, counts in summary["by"]["object"].items():
+        table.add_row(name, str(counts["episodes"]), str(counts["solved"]))
     table.add_row("all", str(summary["episodes"]), str(summary["solved"]), style="bold")
     console.print(table)
     for item in summary["unsolved"]:

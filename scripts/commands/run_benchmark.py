@@ -1,4 +1,4 @@
-"""Runs the paper's 81 scenarios in the twin: the same candidates for every method, one row an episode.
+"""Run the paper's 81 scenarios in the twin: the same candidates for every method, one row per episode.
 
 ./z1 bench                                       # vanilla, mvb and full on all 81; some minutes on two cores
 ./z1 bench --methods full --objects box --seeds 0 1 2 --out out/boxes
@@ -6,6 +6,9 @@
 ./z1 bench --methods full --physics-noise --clutter 0 2 --top-k 3
 ./z1 bench --methods full --mesh drill.stl --scale 0.001 --mass 0.4
 ./z1 bench --seeds 0 1 2 3 4 --ray auto          # on the Ray cluster that this machine is part of
+
+An exception in an episode becomes its row (mode `error`) with a traceback in errors.log, and the run goes on; the exit
+code is then 1. --resume keeps such rows; to run these episodes again give another --out.
 """
 
 from __future__ import annotations
@@ -25,7 +28,7 @@ from scripts.support.progress import make_progress
 if TYPE_CHECKING:
     from sim_twin.benchmark.episodes.rows import Row
     from sim_twin.benchmark.episodes.runner import Task
-    from sim_twin.benchmark.report.pictures import Picture
+    from sim_twin.benchmark.report.pictures import EpisodePicture
     from sim_twin.benchmark.results.store import Store
     from sim_twin.model.parts import GraspObject
     from z1_runtime.config import RuntimeConfig
@@ -33,68 +36,74 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Config:
-    """Which episodes, and how many at a time."""
+    """Options of the benchmark."""
 
     methods: tuple[str, ...] = ("vanilla", "mvb", "full")
-    """vanilla, mvb and full; a setting can be changed, as in `mvb:k=3,alpha=0.5,box=upright,hard_filter=no`."""
+    """Methods: vanilla, mvb and full; settings can be changed, as in `mvb:k=3,alpha=0.5,box=upright,hard_filter=no`."""
     set: Literal["paper", "extended"] = "paper"
-    """The paper's objects in 27 poses each, or the further ones, upright, in 9."""
+    """Objects: the paper's in 27 poses each, or the extended set, upright, in 9."""
     objects: tuple[str, ...] = ()
-    """What stands on the table, if not all objects of the set."""
+    """Objects to run; by default all of the set."""
     mesh: Path | None = None
-    """A mesh of yours (STL, OBJ, PLY, OFF, GLB; z up) instead of the set, in 27 poses; --objects adds others. It need
-    not be watertight, but walls without thickness come out filled. What cannot stand by itself is held as leaning
-    objects are."""
+    """Your mesh (STL, OBJ, PLY, OFF, GLB; z up) instead of the set, in 27 poses; --objects adds others. It need not be
+    watertight, but walls without thickness come out filled. A mesh that cannot stand is held as leaning objects are."""
     scale: float = 1.0
     """Metres in one unit of --mesh: 0.001 for a file in millimetres."""
     mass: float = 0.2
     """Mass of --mesh [kg]."""
     occlusion: tuple[float, ...] = (0.0,)
-    """Shares of the object hidden from the camera."""
+    """Ratios of the object's pixels that are occluded."""
     clutter: tuple[int, ...] = (0,)
-    """Numbers of neighbours, 0 to 3, that stand around the object; it is told to the detector by its class, or by the
-    twin's truth where the detector knows no classes."""
+    """Numbers of neighbours, 0 to 3, around the object; the detector selects the object by its class, or by the twin's
+    ground truth if it knows no classes."""
     physics_noise: bool = False
-    """Friction and mass are off by up to 30 %, the camera by 3 mm and 1°, and the arm is up to 20 ms late."""
+    """Vary friction and mass by up to 30 %, the camera's pose by 3 mm and 1°, and the arm's latency up to 20 ms."""
     seeds: tuple[int, ...] = (0,)
-    """Each seed runs all poses anew, with other noise and other candidates."""
+    """Seeds: each runs all poses, with other noise and other candidates."""
     top_k: int = 1
-    """Grasps that may be executed in an episode: after a failure the scene is looked at again, as it then is."""
+    """Grasps that may be executed in an episode: after a failure the scene as it then is is captured again."""
     generator: str | None = None
-    """Grasp generator; the configuration's if not given."""
+    """Grasp generator; by default the configuration's."""
     detector: str | None = None
-    """Detector; the configuration's if not given. One that knows classes is told each of the paper's objects' own; what
-    is of no class that it knows is left to `tabletop`, unless the configuration names an object_class."""
+    """Detector; by default the configuration's. One that knows classes gets the class of each of the paper's objects;
+    objects of unknown class are left to `tabletop`, unless the configuration names an object_class."""
     config: Path | None = None
     """A YAML file of settings (see `./z1 show-config`)."""
     jobs: int = 2
-    """Episodes side by side, a process each."""
+    """Worker processes."""
     ray: str | None = None
     """Address of a Ray cluster to run on instead: `auto`, HOST:6379 or ray://HOST:10001 (the extra `ray`)."""
     resume: bool = False
-    """Go on with an interrupted run in the same folder."""
+    """Continue an interrupted run in the same folder."""
     pictures: Literal["failures", "all", "none"] = "failures"
-    """Final states to draw into pictures/: up to 12 failures, which the report shows too, or every episode's."""
+    """Final states to render into pictures/: up to 12 failures, which the report shows too, or all episodes."""
     recordings: Literal["shown", "failures", "all", "none"] = "shown"
-    """Episodes to write into recordings/ for Rerun, at their first look: what was seen, ranked and chosen; about 2 MB
-    each. `shown`: those with a picture in the report."""
+    """Episodes to write into recordings/ for Rerun: first observation, ranking and plan; about 2 MB each. `shown`:
+    those with a picture in the report."""
     out: Path = Path("out/bench")
-    """Folder for episodes/, episodes.parquet, summary.json, report.html, pictures/ and recordings/."""
+    """Folder for episodes/, episodes.parquet, summary.json, report.html, errors.log, pictures/ and recordings/."""
 
     def __post_init__(self) -> None:
         if self.jobs < 1:
-            raise InvalidValueError(f"jobs is {self.jobs}; allowed is 1 or more.")
+            raise InvalidValueError(
+                f"bench: jobs is out of range ({self.jobs}, allowed 1 or more). Give --jobs 1 or more.",
+                code="jobs_range",
+            )
         if not 1 <= self.top_k <= 10:
-            raise InvalidValueError(f"top-k is {self.top_k}; allowed is 1 to 10.")
+            raise InvalidValueError(
+                f"bench: top-k is out of range ({self.top_k}, allowed 1 to 10). Give --top-k 1 to 10.",
+                code="top_k_range",
+            )
         if self.ray is not None and self.recordings in ("failures", "all"):
             raise InvalidValueError(
-                f"--recordings {self.recordings} would leave files on the cluster's machines; with --ray allowed are "
-                "shown and none."
+                f"bench: --recordings {self.recordings} would leave files on the cluster's machines (allowed with "
+                "--ray: shown and none). Give --recordings shown.",
+                code="recordings_on_cluster",
             )
 
 
 def main(config: Config) -> int:
-    """Run what is missing, and say how it went."""
+    """Run the missing episodes, write the results, and return 1 if any episode ended in an exception, else 0."""
     from sim_twin.benchmark.episodes.methods import parse_method
     from sim_twin.benchmark.episodes.runner import make_tasks
     from sim_twin.benchmark.episodes.scenarios import OBJECT_SETS, grid
@@ -104,7 +113,7 @@ def main(config: Config) -> int:
     from z1_runtime.config import load_config
 
     methods = [parse_method(text) for text in config.methods]
-    shapes = _shapes(config)
+    shapes = _load_shapes(config)
     objects = (*shapes, *config.objects) or OBJECT_SETS[config.set]
     scenarios = grid(
         objects, config.seeds, config.occlusion, config.clutter, physics_noise=config.physics_noise, shapes=shapes
@@ -113,7 +122,7 @@ def main(config: Config) -> int:
     runtime = replace(load_config(config.config), **{key: value for key, value in changes.items() if value})
     store = Store(config.out, config.resume)
     tasks = make_tasks(
-        scenarios, methods, runtime, store.done(), top_k=config.top_k, recordings=_recordings_of_all(config)
+        scenarios, methods, runtime, store.done(), top_k=config.top_k, recordings=_recordings_during_run(config)
     )
     console = Console(highlight=False)
     report = config.out / "report.html"
@@ -127,15 +136,25 @@ def main(config: Config) -> int:
             run = {"version": version("z1-grasp"), "command": plain(asdict(config)), "settings": asdict(runtime)}
             summary = write_summary(rows, config.out / "summary.json", plain(run))
             write_report(rows, summary, report)
-            _print(console, summary)
-    if pictures := _pictures(rows, config, runtime, shapes):
+            _print_summary(console, summary)
+    if pictures := _draw_pictures(rows, config, runtime, shapes):
         write_report(rows, summary, report, pictures)
     console.print(f"rows: {config.out}/episodes.parquet, figures: {config.out}/summary.json and report.html")
-    return 0
+    return _exit_code(summary, config.out, console)
 
 
-def _shapes(config: Config) -> dict[str, GraspObject]:
-    """Return the user's own object by its name."""
+def _exit_code(summary: dict[str, Any], out: Path, console: Console) -> int:
+    """Return 1 where an exception ended an episode, and print how many; else 0."""
+    from sim_twin.benchmark.results.store import ERROR_LOG
+
+    errors = sum(method["errors"] for method in summary.get("methods", {}).values())
+    if errors:
+        console.print(f"[red]{errors} episodes ended in an exception[/red]: tracebacks in {out / ERROR_LOG}")
+    return int(errors > 0)
+
+
+def _load_shapes(config: Config) -> dict[str, GraspObject]:
+    """Return the object of the user's mesh by its name."""
     if config.mesh is None:
         return {}
     from sim_twin.model.mesh_objects import load_mesh_object
@@ -144,8 +163,8 @@ def _shapes(config: Config) -> dict[str, GraspObject]:
     return {name: shape}
 
 
-def _recordings_of_all(config: Config):
-    """Return what is recorded while it is run."""
+def _recordings_during_run(config: Config):
+    """Return the recordings to make during the run; None for none."""
     from sim_twin.benchmark.episodes.recordings import Recordings
 
     if config.recordings not in ("failures", "all"):
@@ -154,16 +173,16 @@ def _recordings_of_all(config: Config):
 
 
 def _run(tasks: list[Task], config: Config, store: Store, console: Console) -> None:
-    tally: dict[str, list[int]] = {}
+    counts: dict[str, list[int]] = {}
     for row in store.rows(["success"]):
-        _count(tally, row)
+        _count(counts, row)
     with make_progress(console) as progress:
         bar = progress.add_task("", total=len(tasks))
         for rows in _rows_of(tasks, config):
             store.add(rows)
             for row in rows:
-                _count(tally, row)
-            progress.update(bar, advance=1, description="  ".join(f"{m} {s}/{n}" for m, (s, n) in tally.items()))
+                _count(counts, row)
+            progress.update(bar, advance=1, description="  ".join(f"{m} {s}/{n}" for m, (s, n) in counts.items()))
 
 
 def _rows_of(tasks: list[Task], config: Config) -> Iterator[list[Row]]:
@@ -175,14 +194,16 @@ def _rows_of(tasks: list[Task], config: Config) -> Iterator[list[Row]]:
     return run_tasks(tasks, config.jobs) if config.ray is None else run_tasks_on_ray(tasks, config.ray)
 
 
-def _count(tally: dict[str, list[int]], row: Row) -> None:
-    count = tally.setdefault(row["method"], [0, 0])
+def _count(counts: dict[str, list[int]], row: Row) -> None:
+    count = counts.setdefault(row["method"], [0, 0])
     count[0] += row["success"]
     count[1] += 1
 
 
-def _pictures(rows: list[Row], config: Config, runtime: RuntimeConfig, shapes: dict[str, GraspObject]) -> list[Picture]:
-    """Draw pictures, and make the recordings that go with them: episodes are the same whenever they are run."""
+def _draw_pictures(
+    rows: list[Row], config: Config, runtime: RuntimeConfig, shapes: dict[str, GraspObject]
+) -> list[EpisodePicture]:
+    """Draw pictures and make their recordings; an episode run again for its recording is the same as before."""
     from sim_twin.benchmark.episodes.episode import record_scenario, recording_name
     from sim_twin.benchmark.episodes.methods import parse_method
     from sim_twin.benchmark.episodes.runner import make_grasp_selector
@@ -191,7 +212,7 @@ def _pictures(rows: list[Row], config: Config, runtime: RuntimeConfig, shapes: d
 
     folder, pictures = config.out / "recordings", []
     for row, picture in draw_pictures(rows, config.pictures, config.out / "pictures", shapes):
-        scenario, method = Scenario.of(row, shapes), parse_method(row["method"])
+        scenario, method = Scenario.from_row(row, shapes), parse_method(row["method"])
         path = folder / recording_name(scenario, method)
         if config.recordings == "shown" and not path.exists():
             record_scenario(scenario, method, lambda s, seed: make_grasp_selector(runtime, s, seed), folder)
@@ -200,7 +221,7 @@ def _pictures(rows: list[Row], config: Config, runtime: RuntimeConfig, shapes: d
     return pictures
 
 
-def _print(console: Console, summary: dict[str, Any]) -> None:
+def _print_summary(console: Console, summary: dict[str, Any]) -> None:
     table = Table("method", "episodes", "success", "95 %", "first-ranked only", "95 %", "how the others ended")
     for name, method in summary["methods"].items():
         modes = ", ".join(f"{mode} {n}" for mode, n in method["modes"].items() if mode != "success")
@@ -208,9 +229,9 @@ def _print(console: Console, summary: dict[str, Any]) -> None:
             name,
             str(method["episodes"]),
             f"{method['rate']:.1%}",
-            _interval(method["rate_95"]),
+            _format_interval(method["rate_95"]),
             f"{method['rate_top1']:.1%}",
-            _interval(method["rate_top1_95"]),
+            _format_interval(method["rate_top1_95"]),
             modes,
         )
     console.print(table)
@@ -221,14 +242,14 @@ def _print(console: Console, summary: dict[str, Any]) -> None:
         first, second = pair["methods"]
         console.print(
             f"{pair['reading']}: only {first} {pair['only_first']}, only {second} {pair['only_second']} of "
-            f"{pair['scenarios']}, {100 * pair['difference']:+.1f} points ({_points(pair['difference_95'])}), "
+            f"{pair['scenarios']}, {100 * pair['difference']:+.1f} points ({_format_points(pair['difference_95'])}), "
             f"McNemar p = {pair['p']:.2g}"
         )
 
 
-def _points(interval: tuple[float, float]) -> str:
+def _format_points(interval: tuple[float, float]) -> str:
     return f"{100 * interval[0]:+.1f} to {100 * interval[1]:+.1f}"
 
 
-def _interval(interval: tuple[float, float]) -> str:
+def _format_interval(interval: tuple[float, float]) -> str:
     return f"{interval[0]:.1%} to {interval[1]:.1%}"

@@ -158,7 +158,7 @@ def _ground_truth(robot: Robot, config: Config, stack: ExitStack) -> Callable[[]
 
     if robot.devices.world is not None:
         return partial(read_ground_truth, robot.devices.world)
-    return stack.enter_context(GroundTruthClient(config.bus)).truth
+    return stack.enter_context(GroundTruthClient(config.bus)).read
 
 
 def _pick(

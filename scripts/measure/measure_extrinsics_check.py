@@ -19,8 +19,8 @@ from rich.table import Table
 from hal.base import z1
 from hal.base.clock import Stopwatch
 from hal.base.transforms import inverse, transform_points
+from sim_twin.benchmark.episodes.execution import capture
 from sim_twin.benchmark.episodes.scenarios import PAPER_OBJECTS, grid
-from sim_twin.benchmark.episodes.trial import look
 from z1_runtime.perception.extrinsics_check import ExtrinsicsCheck
 from z1_runtime.perception.self_filter import SelfFilter
 
@@ -45,7 +45,7 @@ def main(config: Config) -> None:
     for number in track(range(config.frames), description="frames"):
         error = {"mount_error_m": config.error_m, "mount_error_deg": config.error_deg, "mount_seed": number}
         scene = replace(poses[number * len(poses) // config.frames].scene(), seed=number, **error)
-        frame, q = look(scene)
+        frame, q = capture(scene)
         watch = Stopwatch()
         jaw = float(q[-1])
         correction = check.correct(frame, SelfFilter().gripper_pixels(frame, jaw), jaw, z1.T_FLANGE_CAMERA)

@@ -88,7 +88,7 @@ def _remote_ground_truth(bus: BusConfig, stack: ExitStack) -> Callable[[], Groun
 
     client = stack.enter_context(GroundTruthClient(bus))
     try:  # a real robot has no such service, and a twin may have another scene
-        return client.truth if client.truth().T_base_board is not None else None
+        return client.read if client.read().T_base_board is not None else None
     except HalTimeoutError:
         return None
 

@@ -1,11 +1,11 @@
-"""The progress bar of commands that run many scenarios: how many of how many, how long it took and how long is left."""
+"""Progress bar of commands that run many scenarios, with the times elapsed and remaining."""
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 
 def make_progress(console: Console, of: str = "scenarios") -> Progress:
-    """Return a bar that names what it counts in front, and shows each task's description at its end."""
+    """Return a bar with `of`, the name of the counted items, in front and each task's description at its end."""
     return Progress(
         TextColumn(of),
         BarColumn(),

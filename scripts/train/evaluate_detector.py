@@ -33,7 +33,7 @@ from scripts.train.make_detection_dataset import read_labels
 from sim_twin.benchmark.episodes.scenarios import PAPER_OBJECTS, Scenario, grid
 from sim_twin.camera.d405 import INTRINSICS, measure_colour
 from sim_twin.detection_data.props import CLASSES
-from sim_twin.detection_data.scenes import Appearance, Label, Picture, draw_scenario
+from sim_twin.detection_data.scenes import Appearance, Label, LabelledImage, draw_scenario
 
 TARGETS = {
     "box_map50": 0.97,
@@ -140,7 +140,7 @@ def measure_empty(detector: YoloModel, data: Path) -> dict[str, object]:
     }
 
 
-def draw_twin_views() -> Iterator[tuple[Scenario, Picture]]:
+def draw_twin_views() -> Iterator[tuple[Scenario, LabelledImage]]:
     """Yield the 81 scenarios in the twin's wrist camera at home, noise included."""
     import mujoco
 
@@ -163,22 +163,24 @@ def draw_twin_views() -> Iterator[tuple[Scenario, Picture]]:
             mujoco.mj_camlight(world.model, data)
             view = renderer.render(data)
             colour = measure_colour(view.colour, scenario.draw_seed, 0)
-            yield scenario, Picture(colour=colour, labels=(Label(name=name, mask=view.mask),), look="twin")
+            yield scenario, LabelledImage(colour=colour, labels=(Label(name=name, mask=view.mask),), appearance="twin")
         renderer.close()
 
 
-def draw_varied_views(look: Appearance) -> Iterator[tuple[Scenario, Picture]]:
+def draw_varied_views(look: Appearance) -> Iterator[tuple[Scenario, LabelledImage]]:
     """Yield the same poses, each with a random room and camera."""
-    from sim_twin.detection_data.scene_renderer import Stage
+    from sim_twin.detection_data.scene_renderer import SceneRenderer
 
-    stage = Stage(_STAGE_SEED)
+    renderer = SceneRenderer(_STAGE_SEED)
     for scenario in grid():
         rng = np.random.default_rng([_STAGE_SEED, scenario.draw_seed])
         yield (
             scenario,
-            draw_scenario(stage, scenario.object, scenario.scene().T_base_object(), rng, look=look, jaw_rad=_JAW_RAD),
+            draw_scenario(
+                renderer, scenario.object, scenario.scene().T_base_object(), rng, appearance=look, jaw_rad=_JAW_RAD
+            ),
         )
-    stage.close()
+    renderer.close()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -190,7 +192,7 @@ class ViewResults:
     """Some of the views, drawn on."""
 
 
-def measure_views(detector: YoloModel, views: Iterator[tuple[Scenario, Picture]], look: str) -> ViewResults:
+def measure_views(detector: YoloModel, views: Iterator[tuple[Scenario, LabelledImage]], look: str) -> ViewResults:
     """Return the number of the 81 views in which the object is found with an IoU of at least 0.8, and the failures."""
     ious: dict[str, float] = {}
     tiles = []

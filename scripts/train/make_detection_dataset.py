@@ -21,7 +21,7 @@ import tyro
 from rich.progress import track
 
 from sim_twin.detection_data.props import CLASSES
-from sim_twin.detection_data.scenes import Label, Picture, SceneMix
+from sim_twin.detection_data.scenes import Label, LabelledImage, SceneMix
 
 SPLITS = {"train": 1_000_000, "val": 2_000_000, "empty": 3_000_000}
 """Name to the first seed: no two splits share a seed, so neither props, textures nor lights."""
@@ -98,19 +98,19 @@ def plan_shards(config: Config) -> list[Shard]:
 
 def make_shard(shard: Shard) -> None:
     """Draw a shard's pictures and move them to their folder when complete."""
-    from sim_twin.detection_data.scene_renderer import Stage
+    from sim_twin.detection_data.scene_renderer import SceneRenderer
     from sim_twin.detection_data.scenes import draw_scene
 
     images = shard.out / "partial" / f"{shard.seed}.{os.getpid()}"
     labels = shard.out / "labels" / shard.split / str(shard.seed)
     images.mkdir(parents=True)
     labels.mkdir(parents=True, exist_ok=True)
-    stage = Stage(shard.seed)
+    renderer = SceneRenderer(shard.seed)
     for number in range(shard.count):
-        picture = draw_scene(stage, np.random.default_rng([shard.seed, 2, number]), shard.mix)
-        name = f"{number:04d}_{picture.look}"
+        picture = draw_scene(renderer, np.random.default_rng([shard.seed, 2, number]), shard.mix)
+        name = f"{number:04d}_{picture.appearance}"
         _write_picture(picture, images / f"{name}.jpg", labels / f"{name}.txt")
-    stage.close()
+    renderer.close()
     if shard.folder.is_dir():  # another process was faster
         shutil.rmtree(images)
     else:
@@ -156,7 +156,7 @@ def read_labels(path: Path, shape: tuple[int, int]) -> tuple[Label, ...]:
     return tuple(labels)
 
 
-def _write_picture(picture: Picture, image: Path, labels: Path) -> None:
+def _write_picture(picture: LabelledImage, image: Path, labels: Path) -> None:
     quality = [cv2.IMWRITE_JPEG_QUALITY, 92]
     cv2.imwrite(str(image), cv2.cvtColor(picture.colour, cv2.COLOR_RGB2BGR), quality)
     labels.write_text("".join(to_line(label) + "\n" for label in picture.labels))

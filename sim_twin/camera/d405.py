@@ -1,4 +1,4 @@
-"""The RealSense D405 as the twin has it: intrinsics, and what its stereo does to an exact depth image.
+"""The twin's RealSense D405: intrinsics, and the stereo noise of an exact depth image.
 
 Sources: Intel's datasheet and depth-quality tables, and figures measured on real units.
 """
@@ -16,7 +16,7 @@ FRAME_PERIOD_S = 1.0 / 30.0
 DEPTH_UNIT_M = 1e-4
 BASELINE_M = 0.018
 MIN_Z_M = 0.070
-"""Nearer than this the stereo has no match at 640×480 (datasheet: 70 mm at 848×480; seen: breaks up below 70 mm)."""
+"""Nearer than this the stereo has no match at 640×480 (datasheet: 70 mm at 848×480; measured: fails below 70 mm)."""
 MAX_Z_M = 6.5535
 """Largest distance that fits 16 bits of 0.1 mm."""
 DISPARITY_STEP_PX = 1.0 / 32.0
@@ -25,8 +25,8 @@ DISPARITY_SD_PX = 0.08
 
 _CORRELATION_PX = 3  # half width of the box that smooths the noise: the matcher compares 7 to 9 pixels at a time
 _EDGE_RATIO = 0.02  # neighbours that differ by more than 2 % of the depth are an edge
-_EDGE_LOSS = 0.45  # share of edge pixels without a match
-_GRAZING_COS = 0.18  # surfaces seen at more than 80° from their normal give no match
+_EDGE_LOSS = 0.45  # ratio of edge pixels without a match
+_GRAZING_COS = 0.18  # surfaces at more than 80° from their normal give no match
 _BLOB_SIGMA = 3.4  # smooth noise above this is a patch without texture: a hole of a few pixels
 _COLOUR_SD = 1.5  # of 255
 
@@ -75,28 +75,28 @@ def _smooth_noise(height: int, width: int, key: np.uint64, radius: int) -> np.nd
 
 
 @numba.njit(nogil=True, cache=True)
-def _seen_by_both(z: np.ndarray, focal_baseline: float) -> np.ndarray:
-    """Return where (H, W) the right imager sees what the left one sees.
+def _visible_to_both(z: np.ndarray, focal_baseline: float) -> np.ndarray:
+    """Return the left image's pixels (H, W) that are visible in the right one too.
 
-    Column u of the left image lies at u − f·B/z in the right one: below zero it is outside, and behind anything nearer
-    further right that lands on the same or a lower column it is hidden.
+    Column u of the left image is at u − f·B/z in the right one: below zero it is outside, and it is occluded by
+    anything nearer, further right, that maps to the same or a lower column.
     """
     height, width = z.shape
-    seen = np.zeros((height, width), np.bool_)
+    visible = np.zeros((height, width), np.bool_)
     for v in range(height):
         leftmost = np.inf
         for u in range(width - 1, -1, -1):
             if z[v, u] <= 0.0:
                 continue
             right_u = u - focal_baseline / z[v, u]
-            seen[v, u] = 0.0 <= right_u < leftmost + 0.5
+            visible[v, u] = 0.0 <= right_u < leftmost + 0.5
             leftmost = min(leftmost, right_u)
-    return seen
+    return visible
 
 
 @numba.njit(nogil=True, cache=True)
 def _is_grazing(z: np.ndarray, v: int, u: int, pinhole: tuple[float, float, float, float]) -> bool:
-    """True where the surface through the four neighbours is seen at too flat an angle."""
+    """True where the surface through the four neighbours is at too flat an angle."""
     fx, fy, cx, cy = pinhole
     zc = z[v, u]
     x, y = (u - cx) / fx, (v - cy) / fy
@@ -112,19 +112,19 @@ def _measure(z: np.ndarray, key: np.uint64, pinhole: tuple[float, float, float, 
     height, width = z.shape
     focal_baseline = pinhole[0] * BASELINE_M
     noise = _smooth_noise(height, width, key, _CORRELATION_PX)
-    seen = _seen_by_both(z, focal_baseline)
+    visible = _visible_to_both(z, focal_baseline)
     out = np.zeros((height, width), np.float32)
     for v in range(1, height - 1):
         for u in range(1, width - 1):
             zc = z[v, u]
-            if not seen[v, u] or zc < min_z_m or zc > MAX_Z_M or noise[v, u] > _BLOB_SIGMA:
+            if not visible[v, u] or zc < min_z_m or zc > MAX_Z_M or noise[v, u] > _BLOB_SIGMA:
                 continue
             low, high = zc, zc
             for near in (z[v, u - 1], z[v, u + 1], z[v - 1, u], z[v + 1, u]):
                 low, high = min(low, near), max(high, near)
             if high - low > _EDGE_RATIO * zc:
-                share = float(_hash(key ^ np.uint64(v * width + u + 0x5DEECE66D)) >> np.uint64(11)) / 2.0**53
-                if share < _EDGE_LOSS or _is_grazing(z, v, u, pinhole):
+                chance = float(_hash(key ^ np.uint64(v * width + u + 0x5DEECE66D)) >> np.uint64(11)) / 2.0**53
+                if chance < _EDGE_LOSS or _is_grazing(z, v, u, pinhole):
                     continue
             disparity = focal_baseline / zc + DISPARITY_SD_PX * noise[v, u]
             disparity = np.round(disparity / DISPARITY_STEP_PX) * DISPARITY_STEP_PX
@@ -167,7 +167,7 @@ def _key(seed: int, sequence: int) -> np.uint64:
 def measure_depth(
     z: np.ndarray, seed: int, sequence: int, pinhole: Intrinsics = INTRINSICS, min_z_m: float = MIN_Z_M
 ) -> np.ndarray:
-    """Return what the stereo would measure (H, W) float32 [m], 0 where it finds no match.
+    """Return the depth that the stereo measures (H, W) float32 [m], 0 where it finds no match.
 
     Args:
         z: exact distance along the optical axis (H, W) float32 [m]; 0 where nothing is hit.
@@ -179,7 +179,7 @@ def measure_depth(
     The disparity f·B/z gets noise of 0.08 px, correlated over 7 pixels, is quantised to 1/32 px and turned back into a
     depth in units of 0.1 mm, so that sigma_z = z²·sd/(f·B): 0.5 mm at 0.2 m, 2.9 mm at 0.5 m. No match is found nearer
     than min-Z, in the band at the left that only the left imager sees, in the shadow left of near things, at part of
-    the edges, on surfaces seen at a grazing angle, and in small patches at random.
+    the edges, on surfaces visible at a grazing angle, and in small patches at random.
     """
     i = pinhole
     return _measure(z, _key(seed, sequence), (i.fx, i.fy, i.cx, i.cy), min_z_m)

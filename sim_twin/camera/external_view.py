@@ -1,4 +1,4 @@
-"""The scene from outside, for people: pictures and the README, never for the robot."""
+"""The scene from outside, for reports and documentation, never for the robot."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from sim_twin.camera.rays import RayCaster
 from sim_twin.model.scene import SceneConfig, build_model
 from sim_twin.model.z1_mjcf import GROUP_MOUNT, GROUP_SCENE, GROUP_VISUAL
 
-_SEEN = (GROUP_SCENE, GROUP_VISUAL, GROUP_MOUNT)
+_GROUPS = (GROUP_SCENE, GROUP_VISUAL, GROUP_MOUNT)
 _LOOK_AT_M = np.array([0.25, 0.0, 0.21])
 _DISTANCE_M = 0.80
 _AZIMUTH_DEG, _ELEVATION_DEG = 122.0, -14.0
 _PASSES = 8
 _SUN_RADIUS = 0.03
-"""Half width of the sun as seen from the table, as a slope: pictures with suns all over it add up to soft shadows."""
+"""Half width of the sun from the table, as a slope: pictures with suns all over it add up to soft shadows."""
 
 
 def draw_picture(config: SceneConfig, qpos: np.ndarray, width: int = 1280, height: int = 720) -> bytes:
@@ -30,14 +30,14 @@ def draw_picture(config: SceneConfig, qpos: np.ndarray, width: int = 1280, heigh
     data.qpos[:] = qpos
     mujoco.mj_forward(model, data)
     file = io.BytesIO()
-    Image.fromarray(draw_outside(model, data, width, height)).save(file, format="PNG", optimize=True)
+    Image.fromarray(render_external(model, data, width, height)).save(file, format="PNG", optimize=True)
     return file.getvalue()
 
 
-def draw_outside(
+def render_external(
     model: mujoco.MjModel, data: mujoco.MjData, width: int, height: int, kind: str | None = None
 ) -> np.ndarray:
-    """Return a picture (height, width, 3) uint8, from beside the table, of the state `data` (kinematics computed).
+    """Return a picture (height, width, 3) uint8, from the table's side, of the state `data` (kinematics computed).
 
     Args:
         model: the scene.
@@ -56,7 +56,7 @@ def _draw_with_gl(model: mujoco.MjModel, data: mujoco.MjData, width: int, height
     scene, option, camera = mujoco.MjvScene(model, maxgeom=500), mujoco.MjvOption(), mujoco.MjvCamera()
     scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION.value] = False
     option.geomgroup[:] = 0
-    option.geomgroup[list(_SEEN)] = 1
+    option.geomgroup[list(_GROUPS)] = 1
     camera.lookat[:] = _LOOK_AT_M
     camera.distance, camera.azimuth, camera.elevation = _DISTANCE_M, _AZIMUTH_DEG, _ELEVATION_DEG
     total, colour = np.zeros((height, width, 3), np.uint16), np.empty((height, width, 3), np.uint8)
@@ -99,4 +99,4 @@ def _draw_with_rays(model: mujoco.MjModel, data: mujoco.MjData, width: int, heig
     T_base_camera = np.eye(4)
     T_base_camera[:3, :3] = np.column_stack([right, np.cross(forward, right), forward])
     T_base_camera[:3, 3] = _LOOK_AT_M - _DISTANCE_M * forward
-    return RayCaster(model, intrinsics, _SEEN).cast(data, T_base_camera)[0]
+    return RayCaster(model, intrinsics, _GROUPS).cast(data, T_base_camera)[0]

@@ -25,7 +25,7 @@ _size_lock = threading.Lock()
 
 
 def choose(kind: str | None, with_gl: Callable[[], T], with_rays: Callable[[], T]) -> T:
-    """Return what `with_gl` makes or, where no OpenGL can be had, what `with_rays` makes, with one warning.
+    """Return the result of `with_gl` or, without OpenGL, of `with_rays`, with one warning.
 
     Args:
         kind: one of `RENDERERS`; None = what the environment variable says.
@@ -39,7 +39,12 @@ def choose(kind: str | None, with_gl: Callable[[], T], with_rays: Callable[[], T
     global _warned  # noqa: PLW0603 - one warning per process
     kind = kind or os.environ.get(RENDER_VARIABLE) or "auto"
     if kind not in RENDERERS:
-        raise InvalidValueError(f"renderer is {kind!r}; set {RENDER_VARIABLE} to one of: {', '.join(RENDERERS)}.")
+        raise InvalidValueError(
+            f"renderer: the kind is unknown ({kind!r}, allowed {', '.join(RENDERERS)}). Set {RENDER_VARIABLE} to "
+            "one of "
+            "these.",
+            code="unknown_renderer",
+        )
     if kind == "rays":
         return with_rays()
     try:
@@ -69,13 +74,13 @@ class Canvas:
     def __init__(self, model: mujoco.MjModel, width: int, height: int, samples: int = 0) -> None:
         self._gl = open_egl(width, height)
         try:
-            with _size_lock:  # the size travels in the model, which several threads may share
+            with _size_lock:  # the size travels in the model, which several threads may use
                 model.vis.global_.offwidth, model.vis.global_.offheight = width, height
                 model.vis.quality.offsamples = samples
                 self.context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
         except mujoco.FatalError as error:
             self._gl.free()
-            raise CameraError(_no_egl(error)) from error
+            raise CameraError(_no_egl(error), code="no_egl") from error
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self.context)
         self._rect = mujoco.MjrRect(0, 0, width, height)
 
@@ -105,11 +110,14 @@ def open_egl(width: int, height: int):
 
         context = GLContext(width, height)
         context.make_current()
-    # ImportError is how MuJoCo says that there is no driver, AttributeError how PyOpenGL says that there is no library.
+    # MuJoCo raises ImportError where there is no driver, PyOpenGL AttributeError where there is no library.
     except (ImportError, AttributeError, RuntimeError, GlError) as error:
-        raise CameraError(_no_egl(error)) from error
+        raise CameraError(_no_egl(error), code="no_egl") from error
     return context
 
 
 def _no_egl(error: Exception) -> str:
-    return f"No OpenGL through EGL here ({error}): install libegl1 and libgl1-mesa-dri, or set {RENDER_VARIABLE}=rays."
+    return (
+        f"renderer: OpenGL through EGL is not available ({error}). Install libegl1 and libgl1-mesa-dri, or set "
+        f"{RENDER_VARIABLE}=rays."
+    )

@@ -9,7 +9,7 @@ import numpy as np
 
 from hal.base.messages import Intrinsics
 from sim_twin.camera.wrist_view import View, camera_id, object_geoms
-from sim_twin.model.charuco_board import PRINT, BoardSpec, project_print
+from sim_twin.model.charuco_board import PRINT_GEOM, BoardSpec, project_print
 from sim_twin.model.z1_mjcf import GROUP_ARM, GROUP_SCENE
 
 _SKY = np.array([205, 214, 224], np.uint8)
@@ -24,7 +24,7 @@ class RayCaster:
     Args:
         model: the scene.
         intrinsics: of the camera.
-        groups: the geom groups that it sees.
+        groups: the visible geom groups.
     """
 
     def __init__(self, model: mujoco.MjModel, intrinsics: Intrinsics, groups: Sequence[int]) -> None:
@@ -39,7 +39,7 @@ class RayCaster:
         self._rgb = 255.0 * rgba[:, :3]
 
     def cast(self, data: mujoco.MjData, T_base_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return what is seen from `T_base_camera` (4, 4), optical axes, of the state `data` (kinematics computed).
+        """Render from `T_base_camera` (4, 4), optical axes, the state `data` (kinematics computed).
 
         Returns:
             Colour (H, W, 3) uint8, distance along the optical axis (H, W) float32 [m] (0 where nothing is hit), and
@@ -67,7 +67,7 @@ class RayRenderer:
 
     def __init__(self, model: mujoco.MjModel, intrinsics: Intrinsics, board: BoardSpec | None = None) -> None:
         self._intrinsics, self._board = intrinsics, board
-        self._print = model.geom(PRINT).id if board is not None else None
+        self._print = model.geom(PRINT_GEOM).id if board is not None else None
         self._caster = RayCaster(model, intrinsics, (GROUP_SCENE, GROUP_ARM))
         self._camera = camera_id(model)
         self._is_object = np.append(object_geoms(model), False)  # geom −1: nothing hit
@@ -75,14 +75,14 @@ class RayRenderer:
     def render(self, data: mujoco.MjData) -> View:
         """Draw the state `data` (kinematics computed)."""
         T_base_camera = np.eye(4)
-        # OpenGL's camera looks along −z with y up.
+        # OpenGL's camera points along −z with y up.
         T_base_camera[:3, :3] = data.cam_xmat[self._camera].reshape(3, 3) * [1.0, -1.0, -1.0]
         T_base_camera[:3, 3] = data.cam_xpos[self._camera]
         colour, z_m, geoms = self._caster.cast(data, T_base_camera)
         if self._board is not None:
-            seen = geoms == self._print
-            share = project_print(self._board, self._intrinsics, T_base_camera)[seen][:, None] / 255.0
-            colour[seen] = np.round(share * colour[seen])
+            visible = geoms == self._print
+            ink = project_print(self._board, self._intrinsics, T_base_camera)[visible][:, None] / 255.0
+            colour[visible] = np.round(ink * colour[visible])
         return View(colour=colour, z_m=z_m, mask=self._is_object[geoms])
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""What the wrist camera would see without its flaws: colour, exact depth and the object's exact mask.
+"""The wrist camera's image without noise: colour, exact depth and the object's exact mask.
 
 Two ways: OpenGL through EGL, or, where there is none, ray casting.
 """
@@ -35,7 +35,7 @@ def make_renderer(
         model: the scene.
         intrinsics: of the wrist camera.
         kind: one of `sim_twin.camera.gl.RENDERERS`; by default what the environment variable says.
-        board: that lies on the scene's table; rays know no textures.
+        board: on the scene's table; rays have no textures.
         mask: False leaves the object's mask empty, which saves OpenGL a pass.
 
     Raises:

@@ -1,4 +1,4 @@
-"""How everything on a detector's stage looks: as in the twin, or with new colours, textures and lights."""
+"""Appearance of a detector's scene: the twin's own, or domain-randomised colours, textures and lights."""
 
 from __future__ import annotations
 
@@ -7,29 +7,29 @@ from collections.abc import Collection
 import mujoco
 import numpy as np
 
-from sim_twin.detection_data.props import HIDDEN_GROUP
-from sim_twin.detection_data.scene_renderer import FLAT_PX, LIGHTS, SKIN_PX, SKINS, WALLS, Actor, Stage
+from sim_twin.detection_data.props import UNDRAWN_GROUP
+from sim_twin.detection_data.scene_renderer import FLAT_PX, LIGHTS, SKIN_PX, SKINS, WALLS, PropInstance, SceneRenderer
 from sim_twin.detection_data.textures import random_rgb, random_texture
 from sim_twin.model.scene import TABLE_RGBA
 from sim_twin.model.z1_mjcf import GROUP_SCENE
 
 _TEXTURED = 0.35
-"""How many things have a texture; the others have one colour."""
+"""Ratio of props with a texture; the others have one colour."""
 
 
-def dress_as_twin(stage: Stage) -> None:
-    """Give table, floor, walls and lights the twin's own look, and every nominal actor its own colours."""
-    model = stage.model
+def apply_twin_appearance(renderer: SceneRenderer) -> None:
+    """Give table, floor, walls and lights the twin's own appearance, and every nominal prop its own colours."""
+    model = renderer.model
     for name in ("floor", "table"):
-        stage.set_texture(name, np.full((FLAT_PX, FLAT_PX, 3), 255, np.uint8))
+        renderer.set_texture(name, np.full((FLAT_PX, FLAT_PX, 3), 255, np.uint8))
     model.geom("floor").rgba, model.geom("table").rgba = [0.46, 0.48, 0.51, 1.0], TABLE_RGBA
     sky = np.linspace([0.93, 0.95, 0.97], [0.55, 0.66, 0.78], FLAT_PX)[:, None] * np.ones((1, FLAT_PX, 1))
-    stage.set_texture("sky", np.tile((sky * 255).astype(np.uint8), (6, 1, 1)))
+    renderer.set_texture("sky", np.tile((sky * 255).astype(np.uint8), (6, 1, 1)))
     for number in range(WALLS):
-        model.geom(f"wall_{number}").group = HIDDEN_GROUP
-    for actor in stage.actors:
-        _dress_in_own_colours(model, actor)
-    model.geom_rgba[stage.arm_geoms] = stage.arm_rgba
+        model.geom(f"wall_{number}").group = UNDRAWN_GROUP
+    for instance in renderer.props:
+        _apply_own_colours(model, instance)
+    model.geom_rgba[renderer.arm_geoms] = renderer.arm_rgba
     model.light_active[:] = [1] + [0] * (LIGHTS - 1)
     model.light_type[0] = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
     model.light_pos[0], model.light_dir[0] = [-0.3, -1.2, 2.2], np.array([0.35, 0.7, -1.0]) / 1.27
@@ -37,59 +37,63 @@ def dress_as_twin(stage: Stage) -> None:
     model.vis.headlight.ambient, model.vis.headlight.diffuse = [0.30, 0.30, 0.32], [0.25] * 3
 
 
-def dress_at_random(stage: Stage, rng: np.random.Generator, but: Collection[Actor] = ()) -> None:
-    """Give everything new colours, textures and lights; the actors `but` keep their own colours."""
-    _dress_surroundings(stage, rng)
+def randomize_appearance(
+    renderer: SceneRenderer, rng: np.random.Generator, keep: Collection[PropInstance] = ()
+) -> None:
+    """Give everything new colours, textures and lights; the props `keep` keep their own colours."""
+    _randomize_surroundings(renderer, rng)
     for number in rng.permutation(SKINS)[:4]:  # the others keep theirs from earlier pictures
         side = random_texture(rng, SKIN_PX)
-        stage.set_texture(f"skin_{number}", np.tile(side, (6, 1, 1)))  # six of its own make a cylinder a box
-    for actor in stage.actors:
-        _dress_actor(stage.model, actor, rng)
-    for actor in but:
-        _dress_in_own_colours(stage.model, actor)
+        renderer.set_texture(f"skin_{number}", np.tile(side, (6, 1, 1)))  # six of its own make a cylinder a box
+    for instance in renderer.props:
+        _randomize_prop(renderer.model, instance, rng)
+    for instance in keep:
+        _apply_own_colours(renderer.model, instance)
     tint = np.append(rng.uniform(0.75, 1.2, 3) if rng.random() < 0.5 else np.ones(3), 1.0)
     grey = rng.uniform(0.0, 0.15)
-    stage.model.geom_rgba[stage.arm_geoms] = np.clip((stage.arm_rgba + np.array([grey, grey, grey, 0])) * tint, 0, 1)
-    _light_at_random(stage.model, rng)
+    renderer.model.geom_rgba[renderer.arm_geoms] = np.clip(
+        (renderer.arm_rgba + np.array([grey, grey, grey, 0])) * tint, 0, 1
+    )
+    _randomize_lights(renderer.model, rng)
 
 
-def _dress_surroundings(stage: Stage, rng: np.random.Generator) -> None:
-    model = stage.model
+def _randomize_surroundings(renderer: SceneRenderer, rng: np.random.Generator) -> None:
+    model = renderer.model
     for name in ("floor", "table"):
-        stage.set_texture(name, random_texture(rng, FLAT_PX))
+        renderer.set_texture(name, random_texture(rng, FLAT_PX))
         model.geom(name).rgba = np.append(rng.uniform(0.6, 1.0, 3) if rng.random() < 0.3 else np.ones(3), 1.0)
         model.mat_texrepeat[model.material(name).id] = rng.uniform(0.5, 6.0)
         model.mat_specular[model.material(name).id] = rng.uniform(0.0, 0.5)
     if rng.random() < 0.4:
-        stage.set_texture("sky", np.tile(random_texture(rng, FLAT_PX), (6, 1, 1)))
+        renderer.set_texture("sky", np.tile(random_texture(rng, FLAT_PX), (6, 1, 1)))
     for number in range(WALLS):
         wall = model.geom(f"wall_{number}")
-        wall.group = GROUP_SCENE if rng.random() < 0.5 else HIDDEN_GROUP
+        wall.group = GROUP_SCENE if rng.random() < 0.5 else UNDRAWN_GROUP
         angle, far = rng.uniform(-1.3, 1.3), rng.uniform(1.2, 3.0)
         wall.pos = [far * np.cos(angle), far * np.sin(angle), rng.uniform(-0.5, 0.6)]
         half = rng.uniform(-0.5, 0.5)
         wall.quat = [np.cos((angle + half) / 2), 0.0, 0.0, np.sin((angle + half) / 2)]
         wall.size = [rng.uniform(0.02, 0.1), *rng.uniform(0.6, 1.5, 2)]  # a small one, far off, would be a box
-        _dress_geoms(model, np.array([wall.id]), rng)
+        _randomize_geoms(model, np.array([wall.id]), rng)
 
 
-def _dress_in_own_colours(model: mujoco.MjModel, actor: Actor) -> None:
-    model.geom_matid[actor.geoms] = -1
-    model.geom_rgba[actor.geoms] = [part.rgba for part, _ in actor.prop.parts]
+def _apply_own_colours(model: mujoco.MjModel, instance: PropInstance) -> None:
+    model.geom_matid[instance.geoms] = -1
+    model.geom_rgba[instance.geoms] = [part.rgba for part, _ in instance.prop.parts]
 
 
-def _dress_actor(model: mujoco.MjModel, actor: Actor, rng: np.random.Generator) -> None:
-    if actor.prop.kind == "bottle" and rng.random() < 0.7:  # body, label and cap each of one colour
+def _randomize_prop(model: mujoco.MjModel, instance: PropInstance, rng: np.random.Generator) -> None:
+    if instance.prop.kind == "bottle" and rng.random() < 0.7:  # body, label and cap each of one colour
         body, label, cap = (np.append(random_rgb(rng), 1.0) for _ in range(3))
-        model.geom_matid[actor.geoms] = -1
-        model.geom_rgba[actor.geoms] = body
-        model.geom_rgba[actor.geoms[2]] = label
-        model.geom_rgba[actor.geoms[-1]] = cap
+        model.geom_matid[instance.geoms] = -1
+        model.geom_rgba[instance.geoms] = body
+        model.geom_rgba[instance.geoms[2]] = label
+        model.geom_rgba[instance.geoms[-1]] = cap
         return
-    _dress_geoms(model, actor.geoms, rng)
+    _randomize_geoms(model, instance.geoms, rng)
 
 
-def _dress_geoms(model: mujoco.MjModel, geoms: np.ndarray, rng: np.random.Generator) -> None:
+def _randomize_geoms(model: mujoco.MjModel, geoms: np.ndarray, rng: np.random.Generator) -> None:
     """One skin or one colour for all of them."""
     if rng.random() < _TEXTURED:
         number = model.material(f"skin_{rng.integers(SKINS)}").id
@@ -101,7 +105,7 @@ def _dress_geoms(model: mujoco.MjModel, geoms: np.ndarray, rng: np.random.Genera
     model.geom_rgba[geoms] = np.append(random_rgb(rng), 1.0)
 
 
-def _light_at_random(model: mujoco.MjModel, rng: np.random.Generator) -> None:
+def _randomize_lights(model: mujoco.MjModel, rng: np.random.Generator) -> None:
     ambient, head = rng.uniform(0.12, 0.45), rng.uniform(0.0, 0.45)
     model.vis.headlight.ambient = ambient * rng.uniform(0.85, 1.0, 3)
     model.vis.headlight.diffuse = head * rng.uniform(0.85, 1.0, 3)

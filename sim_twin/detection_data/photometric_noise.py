@@ -1,4 +1,4 @@
-"""What a camera does to a picture: exposure, white balance, blur, noise, vignetting and JPEG."""
+"""Photometric augmentation of an image: exposure, white balance, blur, noise, vignetting and JPEG."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 _DARK = 45.0
 
 
-def spoil_photo(colour: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def augment_image(colour: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Return `colour` (H, W, 3) uint8 RGB with random flaws of a cheap camera in a badly lit room.
 
     A third of the pictures, if not too dark, only get the little noise of a good exposure. Geometry stays: masks
@@ -23,13 +23,13 @@ def spoil_photo(colour: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         picture = cv2.GaussianBlur(picture, (0, 0), rng.uniform(0.4, 1.6))
     if rng.random() < 0.20:
         picture = _motion_blur(picture, rng)
-    spoilt = _with_noise(picture, rng.uniform(0.5, 6.0), rng)
+    noisy = _with_noise(picture, rng.uniform(0.5, 6.0), rng)
     if rng.random() < 0.4:
         quality = [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(35, 90))]
-        decoded = cv2.imdecode(cv2.imencode(".jpg", spoilt, quality)[1], cv2.IMREAD_COLOR)
+        decoded = cv2.imdecode(cv2.imencode(".jpg", noisy, quality)[1], cv2.IMREAD_COLOR)
         assert decoded is not None
         return np.asarray(decoded)
-    return spoilt
+    return noisy
 
 
 def _expose(colour: np.ndarray, rng: np.random.Generator) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Where camera, objects and what is none stand in a detector's picture."""
+"""Poses of camera, objects and distractors in a detector's image."""
 
 from __future__ import annotations
 
@@ -6,28 +6,28 @@ import numpy as np
 
 from hal.base import z1
 from sim_twin.detection_data.props import CLASSES
-from sim_twin.detection_data.scene_renderer import Actor, Stage
+from sim_twin.detection_data.scene_renderer import PropInstance, SceneRenderer
 
 NEAREST_M = 0.05
-"""No corner of an object comes nearer to the lens [m]."""
+"""Minimum distance of an object's corners from the lens [m]."""
 _JAW_POINTS = ((0.05, 0, 0), (0.10, 0, 0), (0.14, 0, 0), (0.18, 0, 0), (0.20, 0, 0), (0.03, 0.14, 0))
-"""Points of hand and camera in the flange frame that no object may contain [m]."""
+"""Points of gripper and camera in the flange frame that no object may contain [m]."""
 _END_ON_COS = np.cos(np.deg2rad(25))
-"""Nearer to its axis than this, a bottle or a cylinder looks like any disc."""
+"""Cosine above which a view along its axis shows a bottle or a cylinder as any disc."""
 _TRIES = 60
 
 
-def place_camera(stage: Stage, by_wrist: bool, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Return T_base_camera (4, 4) and the point (3,) it looks at, mid-height of a thing on the table."""
+def place_camera(renderer: SceneRenderer, by_wrist: bool, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Return T_base_camera (4, 4) and the point (3,) in view, mid-height of an object on the table."""
     for _ in range(1000):
         if by_wrist:
-            pose = stage.set_arm(_random_joints(rng))
+            pose = renderer.set_arm(_random_joints(rng))
         else:
-            stage.set_arm(_random_joints(rng))
+            renderer.set_arm(_random_joints(rng))
             pose = _random_view(rng)
-            stage.set_free_camera(pose)
-        centre = _look_at(stage, pose, rng)
-        if centre is not None and (not by_wrist or _hand_is_clear_of_table(stage)):
+            renderer.set_free_camera(pose)
+        centre = _choose_target(renderer, pose, rng)
+        if centre is not None and (not by_wrist or _gripper_clears_table(renderer)):
             return pose, centre
     raise RuntimeError("no camera pose found in 1000 tries")
 
@@ -53,8 +53,8 @@ def _random_view(rng: np.random.Generator) -> np.ndarray:
     target = np.array([rng.uniform(0.25, 0.75), rng.uniform(-0.3, 0.3), rng.uniform(0.02, 0.15)])
     azimuth, elevation = rng.uniform(-np.pi, np.pi), np.deg2rad(rng.triangular(0, 20, 60))
     c = np.cos(elevation)
-    away = np.array([c * np.cos(azimuth), c * np.sin(azimuth), np.sin(elevation)])
-    place = target + rng.uniform(0.22, 0.75) * away
+    direction = np.array([c * np.cos(azimuth), c * np.sin(azimuth), np.sin(elevation)])
+    place = target + rng.uniform(0.22, 0.75) * direction
     place[2] = max(place[2], 0.02)
     forward = (target - place) / np.linalg.norm(target - place)
     right = np.cross(forward, [0.0, 0.0, 1.0])
@@ -67,11 +67,11 @@ def _random_view(rng: np.random.Generator) -> np.ndarray:
     return pose
 
 
-def _look_at(stage: Stage, T_base_camera: np.ndarray, rng: np.random.Generator) -> np.ndarray | None:
-    """Return where a ray through a random pixel meets mid-height above the table, 0.13 to 0.85 m off; or None."""
-    i = stage.intrinsics
+def _choose_target(renderer: SceneRenderer, T_base_camera: np.ndarray, rng: np.random.Generator) -> np.ndarray | None:
+    """Return the point (3,) of a random pixel's ray at mid-height above the table, 0.13 to 0.85 m deep; or None."""
+    i = renderer.intrinsics
     u, v = rng.uniform(0.08, 0.92) * i.width, rng.uniform(0.15, 0.85) * i.height
-    ray = T_base_camera[:3, :3] @ [(u - i.cx) / i.fx, (v - i.cy) / i.fy, 1.0]
+    ray = T_base_camera[:3, :3] @ i.deproject(np.array([u]), np.array([v]), np.ones(1))[0]
     place = T_base_camera[:3, 3]
     if abs(ray[2]) < 0.02:
         return None
@@ -81,25 +81,27 @@ def _look_at(stage: Stage, T_base_camera: np.ndarray, rng: np.random.Generator) 
     return centre if 0.13 < depth < 0.85 and on_table else None
 
 
-def _hand_is_clear_of_table(stage: Stage) -> bool:
-    flange = stage.data.body("link06")
+def _gripper_clears_table(renderer: SceneRenderer) -> bool:
+    flange = renderer.data.body("link06")
     points = np.array(_JAW_POINTS) @ flange.xmat.reshape(3, 3).T + flange.xpos
     return bool(points[:, 2].min() > 0.012)
 
 
-def choose_objects(stage: Stage, rng: np.random.Generator, *, nominal: float, crowd: bool) -> list[Actor]:
-    """One to three objects, or up to eight; a share of `nominal` of them are the benchmark's own."""
-    chosen: list[Actor] = []
+def choose_objects(
+    renderer: SceneRenderer, rng: np.random.Generator, *, nominal: float, crowd: bool
+) -> list[PropInstance]:
+    """One to three objects, or up to eight; the ratio `nominal` of them are the benchmark's own."""
+    chosen: list[PropInstance] = []
     for _ in range(rng.integers(6, 12) if crowd else rng.choice([1, 2, 3], p=[0.55, 0.3, 0.15])):
-        actors = stage.named(str(rng.choice(CLASSES)))
-        actor = actors[0] if rng.random() < nominal else actors[rng.integers(1, len(actors))]
-        if actor not in chosen:
-            chosen.append(actor)
+        props = renderer.named(str(rng.choice(CLASSES)))
+        instance = props[0] if rng.random() < nominal else props[rng.integers(1, len(props))]
+        if instance not in chosen:
+            chosen.append(instance)
     return chosen
 
 
 def _random_lean(rng: np.random.Generator) -> np.ndarray:
-    """A rotation (3, 3): standing, leaning up to 60° or lying, turned anyhow about the vertical."""
+    """Return a rotation (3, 3): upright, leaning up to 60° or horizontal, at any angle about the vertical."""
     kind = rng.random()
     lean = 0.0 if kind < 0.4 else rng.uniform(-np.pi / 3, np.pi / 3) if kind < 0.8 else np.pi / 2
     about = 0.0 if rng.random() < 0.5 else rng.uniform(-np.pi, np.pi)  # half of them lean to or from the arm
@@ -117,18 +119,18 @@ def _about_z(angle: float) -> np.ndarray:
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
-def _standing_at(actor: Actor, xy: np.ndarray, R: np.ndarray, above_m: float = 0.0) -> np.ndarray:
+def _pose_on_table(instance: PropInstance, xy: np.ndarray, R: np.ndarray, above_m: float = 0.0) -> np.ndarray:
     """Return the pose (4, 4) turned by `R`, the lowest point `above_m` over the table."""
     pose = np.eye(4)
     pose[:3, :3] = R
-    lowest = (np.vstack(actor.prop.corners()) @ R[2]).min()
+    lowest = (np.vstack(instance.prop.corners()) @ R[2]).min()
     pose[:3, 3] = [xy[0], xy[1], above_m - lowest]
     return pose
 
 
 def place_objects(
-    stage: Stage,
-    objects: list[Actor],
+    renderer: SceneRenderer,
+    objects: list[PropInstance],
     T_base_camera: np.ndarray,
     *,
     centre: np.ndarray,
@@ -137,67 +139,67 @@ def place_objects(
     end_on: bool,
     rng: np.random.Generator,
 ) -> list[np.ndarray]:
-    """Put the first object at `centre`, the others near it, or in a crowd wherever the camera looks.
+    """Put the first object at `centre`, the others near it, or in a crowd anywhere in the camera's view.
 
     Unless `end_on`, no bottle or cylinder points at the lens, where only colours tell it from any disc.
 
     Returns the poses (4, 4) of those that fit, which stay.
     """
     poses: list[np.ndarray] = []
-    for actor in list(objects):
+    for instance in list(objects):
         for _ in range(_TRIES):
             spread = 0.01 if not poses else 0.16
-            around = _look_at(stage, T_base_camera, rng) if poses and crowd else centre
+            around = _choose_target(renderer, T_base_camera, rng) if poses and crowd else centre
             if around is None:
                 continue
             xy = around[:2] + rng.normal(0.0, 0.01 if crowd else spread, 2)
             above = rng.uniform(0.01, 0.15) if rng.random() < 0.08 else 0.0  # lifted, or falling
-            pose = _standing_at(actor, xy, _random_lean(rng), above)
-            if not end_on and _is_end_on(actor, pose, T_base_camera[:3, 3]):
+            pose = _pose_on_table(instance, xy, _random_lean(rng), above)
+            if not end_on and _is_end_on(instance, pose, T_base_camera[:3, 3]):
                 continue
-            if _fits(stage, actor, pose, others=poses, T_base_camera=T_base_camera, by_wrist=by_wrist):
-                stage.put(actor, pose)
+            if _fits(renderer, instance, pose, others=poses, T_base_camera=T_base_camera, by_wrist=by_wrist):
+                renderer.put(instance, pose)
                 poses.append(pose)
                 break
         else:
-            objects.remove(actor)
+            objects.remove(instance)
     return poses
 
 
 def _fits(
-    stage: Stage,
-    actor: Actor,
+    renderer: SceneRenderer,
+    instance: PropInstance,
     pose: np.ndarray,
     *,
     others: list[np.ndarray],
     T_base_camera: np.ndarray,
     by_wrist: bool,
 ) -> bool:
-    """True when the object is on the table, clear of lens, hand and the other objects' middles."""
+    """True when the object is on the table, clear of lens, gripper and the other objects' middles."""
     if not (-0.25 < pose[0, 3] < 0.97 and abs(pose[1, 3]) < 0.57):
         return False
     if any(np.linalg.norm(pose[:3, 3] - other[:3, 3]) < 0.085 for other in others):
         return False
-    corners = np.vstack(actor.prop.corners())
+    corners = np.vstack(instance.prop.corners())
     depths = (corners @ pose[:3, :3].T + pose[:3, 3] - T_base_camera[:3, 3]) @ T_base_camera[:3, 2]
     if depths.min() < NEAREST_M:
         return False
     if not by_wrist:
         return True
-    flange = stage.data.body("link06")
+    flange = renderer.data.body("link06")
     points = np.array(_JAW_POINTS) @ flange.xmat.reshape(3, 3).T + flange.xpos
     inside = (points - pose[:3, 3]) @ pose[:3, :3]
     low, high = corners.min(axis=0) - 0.012, corners.max(axis=0) + 0.012
     return not bool(np.all((inside > low) & (inside < high), axis=1).any())
 
 
-def _is_end_on(actor: Actor, pose: np.ndarray, lens: np.ndarray) -> bool:
+def _is_end_on(instance: PropInstance, pose: np.ndarray, lens: np.ndarray) -> bool:
     ray = pose[:3, 3] - lens
-    return actor.prop.kind != "box" and abs(float(ray @ pose[:3, 2])) > _END_ON_COS * float(np.linalg.norm(ray))
+    return instance.prop.kind != "box" and abs(float(ray @ pose[:3, 2])) > _END_ON_COS * float(np.linalg.norm(ray))
 
 
 def place_distractors(
-    stage: Stage,
+    renderer: SceneRenderer,
     places: list[np.ndarray],
     T_base_camera: np.ndarray,
     *,
@@ -206,36 +208,36 @@ def place_distractors(
     spread: bool,
     rng: np.random.Generator,
 ) -> None:
-    """Put things of no class, `number` in the mean, apart from the objects at `places` and from the lens.
+    """Put distractors, `number` in the mean, apart from the objects at `places` and from the lens.
 
-    They stand around `centre` (3,), or, if `spread`, wherever the camera looks.
+    Their places are around `centre` (3,), or, if `spread`, anywhere in the camera's view.
     """
-    others = stage.distractors()
-    for actor in (others[k] for k in rng.permutation(len(others))[: rng.poisson(number)]):
+    others = renderer.distractors()
+    for instance in (others[k] for k in rng.permutation(len(others))[: rng.poisson(number)]):
         for _ in range(_TRIES):
-            around = _look_at(stage, T_base_camera, rng) if spread else centre
+            around = _choose_target(renderer, T_base_camera, rng) if spread else centre
             if around is None:
                 continue
             xy = around[:2] + rng.normal(0.0, 0.05 if spread else 0.18, 2)
-            pose = _standing_at(actor, xy, _random_lean(rng))
+            pose = _pose_on_table(instance, xy, _random_lean(rng))
             apart = all(np.linalg.norm(pose[:2, 3] - place[:2, 3]) > 0.09 for place in places)
             if apart and np.linalg.norm(pose[:3, 3] - T_base_camera[:3, 3]) > 0.16 and abs(pose[1, 3]) < 0.57:
-                stage.put(actor, pose)
+                renderer.put(instance, pose)
                 break
 
 
 def place_occluder(
-    stage: Stage, T_base_object: np.ndarray, T_base_camera: np.ndarray, rng: np.random.Generator
+    renderer: SceneRenderer, T_base_object: np.ndarray, T_base_camera: np.ndarray, rng: np.random.Generator
 ) -> None:
-    """Put a distractor on the way from the lens to the object, a little aside."""
-    actor = stage.distractors()[rng.integers(len(stage.distractors()))]
+    """Put a distractor near the line from the lens to the object."""
+    instance = renderer.distractors()[rng.integers(len(renderer.distractors()))]
     way = T_base_object[:3, 3] - T_base_camera[:3, 3]
     far = float(np.linalg.norm(way))
     if far < 0.25:
         return
-    aside = T_base_camera[:3, :2] @ rng.normal(0.0, 0.035, 2)
+    offset = T_base_camera[:3, :2] @ rng.normal(0.0, 0.035, 2)
     pose = np.eye(4)
     pose[:3, :3] = _random_lean(rng)
-    pose[:3, 3] = T_base_camera[:3, 3] + way * (1.0 - rng.uniform(0.09, 0.13) / far) + aside
+    pose[:3, 3] = T_base_camera[:3, 3] + way * (1.0 - rng.uniform(0.09, 0.13) / far) + offset
     if np.linalg.norm(pose[:3, 3] - T_base_camera[:3, 3]) > 0.14:
-        stage.put(actor, pose)
+        renderer.put(instance, pose)

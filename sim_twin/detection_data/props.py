@@ -1,4 +1,4 @@
-"""The things in a detector's training pictures: the three classes in many proportions, and what is none of them."""
+"""Props of a detector's training images: the three classes in many proportions, and distractors."""
 
 from __future__ import annotations
 
@@ -8,13 +8,14 @@ from dataclasses import dataclass, replace
 import mujoco
 import numpy as np
 
+from hal.base.transforms import transform_points
 from sim_twin.model.objects import OBJECTS
-from sim_twin.model.parts import Part, lathe
+from sim_twin.model.parts import Part, make_lathe
 from sim_twin.model.z1_mjcf import GROUP_SCENE
 
 CLASSES = ("bottle", "box", "cylinder")
-"""What the detector tells apart, in the order of the labels' numbers."""
-HIDDEN_GROUP = 5
+"""Classes of the detector, in the order of their label numbers."""
+UNDRAWN_GROUP = 5
 """Geoms of this group are not drawn."""
 
 _RGBA = (0.5, 0.5, 0.5, 1.0)
@@ -22,16 +23,16 @@ _RGBA = (0.5, 0.5, 0.5, 1.0)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Prop:
-    """A thing that a scene may show, made of convex parts in its own frame (origin at mid-height, z up)."""
+    """An object of a scene, made of convex parts in its own frame (origin at mid-height, z up)."""
 
     kind: str
-    """One of `CLASSES`, or what else it is."""
+    """One of `CLASSES`, or the kind of a distractor."""
     parts: tuple[tuple[Part, np.ndarray], ...]
     """Each part with its pose (4, 4) in the prop."""
 
     def corners(self) -> list[np.ndarray]:
         """Return for each part points (N, 3) [m] whose hull it is, in the prop's frame."""
-        return [part.corners() @ pose[:3, :3].T + pose[:3, 3] for part, pose in self.parts]
+        return [transform_points(pose, part.corners()) for part, pose in self.parts]
 
 
 def nominal_prop(name: str) -> Prop:
@@ -56,13 +57,13 @@ def make_class_prop(name: str, rng: np.random.Generator) -> Prop:
 
 
 def make_distractor(rng: np.random.Generator) -> Prop:
-    """Return a thing of no class, and none that looks like one: square to the lens, a plate is a box."""
+    """Return a distractor, of no class and of no shape like one: square to the lens, a plate is a box."""
     kind = list(_DISTRACTORS)[rng.integers(len(_DISTRACTORS))]
     return _DISTRACTORS[kind](rng)
 
 
 def add_prop(spec: mujoco.MjSpec, prop: Prop, name: str) -> list[str]:
-    """Add `prop` as a body called `name` that is moved by hand and collides with nothing; return its geoms' names."""
+    """Add `prop` as a body called `name` that is placed by mocap and collides with nothing; return its geoms' names."""
     body = spec.worldbody.add_body(name=name, mocap=True)
     names = []
     for number, (part, pose) in enumerate(prop.parts):
@@ -125,7 +126,7 @@ def _make_bottle(rng: np.random.Generator) -> tuple[Part, ...]:
     cap = neck * rng.uniform(1.0, 1.25)
     radii = [0.92 * radius, radius, radius, radius, radius, neck, neck, cap]
     profile = tuple((height * h, float(r)) for h, r in zip(heights, radii, strict=True))
-    return lathe(profile, ((0.05, _RGBA),) * 7)
+    return make_lathe(profile, ((0.05, _RGBA),) * 7)
 
 
 def _make_ball(rng: np.random.Generator) -> Prop:

@@ -1,6 +1,6 @@
-"""A stage for a detector's pictures: arm, table, lights and a pool of props in one compiled model.
+"""Renderer of a detector's images: arm, table, lights and a pool of props in one compiled model.
 
-Everything that changes from picture to picture (poses, colours, textures, lights) changes inside the compiled model.
+Everything that changes from image to image (poses, colours, textures, lights) changes inside the compiled model.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from sim_twin.camera.gl import Canvas
 from sim_twin.camera.render import set_pinhole
 from sim_twin.detection_data.props import (
     CLASSES,
-    HIDDEN_GROUP,
+    UNDRAWN_GROUP,
     Prop,
     add_prop,
     make_class_prop,
@@ -27,10 +27,10 @@ from sim_twin.detection_data.props import (
 from sim_twin.model.z1_mjcf import GROUP_ARM, GROUP_MOUNT, GROUP_SCENE, GROUP_VISUAL, add_z1
 
 VARIANTS = 3
-"""Props of each class beside the nominal one."""
+"""Props of each class in addition to the nominal one."""
 DISTRACTORS = 14
 SKINS, SKIN_PX = 10, 64
-"""Textures that things may have, `skin_0` …, and how wide each of a skin's six sides is."""
+"""Number of textures of the props, `skin_0` …, and width of each of a skin's six sides."""
 FLAT_PX = 256
 """Width of the textures `floor`, `table` and of each side of `sky`."""
 LIGHTS, WALLS = 3, 4
@@ -38,16 +38,16 @@ _GEOMS_DRAWN = 800
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Actor:
-    """A prop on the stage, with the numbers of its body and geoms in the model."""
+class PropInstance:
+    """A prop of the renderer, with the numbers of its body and geoms in the model."""
 
     prop: Prop
     mocap: int
     geoms: np.ndarray
 
 
-class Stage:
-    """Draws pictures with exact instance masks; belongs to the thread that made it.
+class SceneRenderer:
+    """Renderer of images with exact instance masks; belongs to the thread that made it.
 
     Args:
         seed: of the props' proportions.
@@ -59,7 +59,7 @@ class Stage:
 
     def __init__(self, seed: int, intrinsics: Intrinsics = INTRINSICS) -> None:
         rng = np.random.default_rng([seed, 1])
-        self.model, self.actors = _build(rng)
+        self.model, self.props = _build(rng)
         self.data = mujoco.MjData(self.model)
         self.arm_geoms = np.flatnonzero(np.isin(self.model.geom_group, (GROUP_ARM, GROUP_VISUAL)))
         self.arm_rgba = self.model.geom_rgba[self.arm_geoms].copy()
@@ -73,39 +73,39 @@ class Stage:
         self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED.value
         self._pixels = np.empty((intrinsics.height, intrinsics.width, 3), np.uint8)
 
-    def named(self, kind: str) -> list[Actor]:
-        """Return the actors of a class, the nominal one first."""
-        return [actor for actor in self.actors if actor.prop.kind == kind]
+    def named(self, kind: str) -> list[PropInstance]:
+        """Return the props of a class, the nominal one first."""
+        return [instance for instance in self.props if instance.prop.kind == kind]
 
-    def distractors(self) -> list[Actor]:
-        """Return the actors of no class."""
-        return [actor for actor in self.actors if actor.prop.kind not in CLASSES]
+    def distractors(self) -> list[PropInstance]:
+        """Return the props of no class."""
+        return [instance for instance in self.props if instance.prop.kind not in CLASSES]
 
     def clear(self) -> None:
-        """Take every actor off the stage."""
-        for actor in self.actors:
-            self.hide(actor)
+        """Remove every prop from the scene."""
+        for instance in self.props:
+            self.hide(instance)
 
-    def hide(self, actor: Actor) -> None:
-        """Take `actor` off the stage."""
-        self.model.geom_group[actor.geoms] = HIDDEN_GROUP
+    def hide(self, instance: PropInstance) -> None:
+        """Remove `instance` from the scene."""
+        self.model.geom_group[instance.geoms] = UNDRAWN_GROUP
 
-    def shows(self, actor: Actor) -> bool:
-        """Return whether `actor` is on the stage."""
-        return bool(self.model.geom_group[actor.geoms[0]] == GROUP_SCENE)
+    def is_shown(self, instance: PropInstance) -> bool:
+        """Return whether `instance` is in the scene."""
+        return bool(self.model.geom_group[instance.geoms[0]] == GROUP_SCENE)
 
-    def put(self, actor: Actor, T_base_prop: np.ndarray) -> None:
-        """Show `actor` at `T_base_prop` (4, 4)."""
-        self.model.geom_group[actor.geoms] = GROUP_SCENE
+    def put(self, instance: PropInstance, T_base_prop: np.ndarray) -> None:
+        """Show `instance` at `T_base_prop` (4, 4)."""
+        self.model.geom_group[instance.geoms] = GROUP_SCENE
         quat = np.empty(4)
         mujoco.mju_mat2Quat(quat, T_base_prop[:3, :3].ravel().copy())
-        self.data.mocap_pos[actor.mocap], self.data.mocap_quat[actor.mocap] = T_base_prop[:3, 3], quat
+        self.data.mocap_pos[instance.mocap], self.data.mocap_quat[instance.mocap] = T_base_prop[:3, 3], quat
 
-    def pose(self, actor: Actor) -> np.ndarray:
-        """Return where `actor` was put, T_base_prop (4, 4)."""
+    def pose(self, instance: PropInstance) -> np.ndarray:
+        """Return the pose T_base_prop (4, 4) of `instance`."""
         pose, rotation = np.eye(4), np.empty(9)
-        mujoco.mju_quat2Mat(rotation, self.data.mocap_quat[actor.mocap])
-        pose[:3, :3], pose[:3, 3] = rotation.reshape(3, 3), self.data.mocap_pos[actor.mocap]
+        mujoco.mju_quat2Mat(rotation, self.data.mocap_quat[instance.mocap])
+        pose[:3, :3], pose[:3, 3] = rotation.reshape(3, 3), self.data.mocap_pos[instance.mocap]
         return pose
 
     def set_arm(self, q: np.ndarray) -> np.ndarray:
@@ -143,23 +143,23 @@ class Stage:
 
         Args:
             camera: `wrist` or `free`.
-            arm: `pieces`, as the twin's wrist camera sees it, `whole` with its camera, or `none`.
+            arm: `pieces`, as in the twin's wrist camera, `whole` with its camera, or `none`.
             shadows: whether lights throw them.
         """
-        self._look(camera, arm, shadows)
+        self._update_scene(camera, arm, shadows)
         self._canvas.draw(self._scene, self._pixels)
         return np.ascontiguousarray(self._pixels[::-1])
 
     def draw_instances(self, camera: str, arm: str) -> np.ndarray:
-        """Return which actor (index in `actors`) each pixel (H, W) int16 shows; −1 = none."""
-        self._look(camera, arm, False)
+        """Return the index in `props` of each pixel's prop, (H, W) int16; −1 = none."""
+        self._update_scene(camera, arm, False)
         by_number = [int(mujoco.mjtRndFlag.mjRND_SEGMENT), int(mujoco.mjtRndFlag.mjRND_IDCOLOR)]
         self._scene.flags[by_number] = True
         self._canvas.draw(self._scene, self._pixels)
         self._scene.flags[by_number] = False
         owner = np.full(self.model.ngeom, -1, np.int16)
-        for number, actor in enumerate(self.actors):
-            owner[actor.geoms] = number
+        for number, instance in enumerate(self.props):
+            owner[instance.geoms] = number
         table = np.full(65536, -1, np.int16)
         for geom in self._scene.geoms[: self._scene.ngeom]:
             if geom.segid >= 0 and geom.objtype == mujoco.mjtObj.mjOBJ_GEOM:
@@ -171,7 +171,7 @@ class Stage:
         """Free the OpenGL context."""
         self._canvas.close()
 
-    def _look(self, camera: str, arm: str, shadows: bool) -> None:
+    def _update_scene(self, camera: str, arm: str, shadows: bool) -> None:
         self._option.geomgroup[:] = 0
         shown = {"pieces": [GROUP_ARM], "whole": [GROUP_VISUAL, GROUP_MOUNT], "none": []}[arm]
         self._option.geomgroup[[GROUP_SCENE, *shown]] = 1
@@ -184,7 +184,7 @@ class Stage:
         set_pinhole(self._scene, self.intrinsics)
 
 
-def _build(rng: np.random.Generator) -> tuple[mujoco.MjModel, list[Actor]]:
+def _build(rng: np.random.Generator) -> tuple[mujoco.MjModel, list[PropInstance]]:
     spec = mujoco.MjSpec()
     spec.compiler.degree = False
     spec.stat.extent, spec.stat.center = 1.0, [0.3, 0.0, 0.2]
@@ -199,7 +199,7 @@ def _build(rng: np.random.Generator) -> tuple[mujoco.MjModel, list[Actor]]:
     geoms = [add_prop(spec, prop, f"prop_{number}") for number, prop in enumerate(props)]
     model = spec.compile()
     return model, [
-        Actor(
+        PropInstance(
             prop=prop,
             mocap=int(model.body(f"prop_{number}").mocapid[0]),
             geoms=np.array([model.geom(name).id for name in geoms[number]]),

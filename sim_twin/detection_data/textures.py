@@ -1,4 +1,4 @@
-"""Procedural textures: what tables, floors, walls and things might look like, from a random generator alone."""
+"""Procedural textures: surfaces of tables, floors, walls and props, from a random generator alone."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 _QUIET = 0.75
-"""Share of quiet surfaces: few tables and fewer packages are in loud checks."""
+"""Ratio of quiet surfaces: few tables and fewer packages are in loud checks."""
 
 
 def random_rgb(rng: np.random.Generator) -> np.ndarray:
@@ -20,11 +20,11 @@ def random_rgb(rng: np.random.Generator) -> np.ndarray:
 def random_texture(rng: np.random.Generator, size: int) -> np.ndarray:
     """Return a picture (size, size, 3) uint8 of a random kind, some of them smudged."""
     kind = _KINDS[rng.integers(len(_KINDS))]
-    share = kind(rng, size)[..., None]
+    blend = kind(rng, size)[..., None]
     low, high = random_rgb(rng), random_rgb(rng)
     if rng.random() < _QUIET:  # both colours alike
         high = np.clip(low + rng.normal(0.0, 0.08, 3), 0.0, 1.0)
-    picture = low + (high - low) * share
+    picture = low + (high - low) * blend
     if rng.random() < 0.5:
         picture = picture * (1.0 - rng.uniform(0.05, 0.35) * _clouds(rng, size)[..., None])
     return (np.clip(picture, 0.0, 1.0) * 255).astype(np.uint8)
@@ -35,7 +35,7 @@ def _grid(size: int) -> tuple[np.ndarray, np.ndarray]:
     return u, v
 
 
-def _turned(rng: np.random.Generator, size: int) -> tuple[np.ndarray, np.ndarray]:
+def _rotated_grid(rng: np.random.Generator, size: int) -> tuple[np.ndarray, np.ndarray]:
     u, v = _grid(size)
     angle = rng.uniform(0.0, np.pi)
     c, s = np.float32(np.cos(angle)), np.float32(np.sin(angle))
@@ -59,18 +59,18 @@ def _clouds(rng: np.random.Generator, size: int) -> np.ndarray:
 
 
 def _gradient(rng: np.random.Generator, size: int) -> np.ndarray:
-    u, _ = _turned(rng, size)
+    u, _ = _rotated_grid(rng, size)
     return (u - u.min()) / (u.max() - u.min())
 
 
 def _checker(rng: np.random.Generator, size: int) -> np.ndarray:
-    u, v = _turned(rng, size)
+    u, v = _rotated_grid(rng, size)
     cells = rng.integers(2, 14)
     return ((np.floor(u * cells) + np.floor(v * cells)) % 2).astype(np.float32)
 
 
 def _stripes(rng: np.random.Generator, size: int) -> np.ndarray:
-    u, _ = _turned(rng, size)
+    u, _ = _rotated_grid(rng, size)
     wave = np.sin(2 * np.pi * u * rng.uniform(2, 24))
     return (wave > rng.uniform(-0.7, 0.7)).astype(np.float32) if rng.random() < 0.6 else 0.5 + 0.5 * wave
 

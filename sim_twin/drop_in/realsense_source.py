@@ -12,7 +12,6 @@ import numpy as np
 from hal.base.clock import Clock, WallClock
 from hal.base.d405 import BASELINE_M, DEPTH_UNIT_M, MIN_Z_M, CaptureRequest, D405Calibration, Exposure
 from hal.base.messages import Intrinsics
-from sim_twin.backends import give_way
 from sim_twin.camera import d405
 from sim_twin.camera.render import make_renderer
 from sim_twin.camera.wrist_view import View, WristRenderer, camera_id
@@ -65,7 +64,7 @@ class TwinSource:
             CameraError: the requested renderer is not available.
         """
         if self._thread is None:
-            initializer = give_way if self._low_priority else None
+            initializer = lower_thread_priority if self._low_priority else None
             self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="twin-d405", initializer=initializer)
         return self._thread.submit(self._expose, request).result()
 

@@ -10,12 +10,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hal.base import z1
+from hal.base.z1_gripper import T_PIVOT_STATIONARY_JAW
 
-if TYPE_CHECKING:  # trimesh takes two seconds to import: who only describes a scene goes without
+if TYPE_CHECKING:  # trimesh takes two seconds to import, and a scene's description needs none of it
     import trimesh
 
 JAW_LINKS = ("gripperStator", "gripperMover")
-_PIVOT_IN_STATOR_M = 0.049  # URDF, jointGripper
+_PIVOT_IN_STATOR_M = -float(T_PIVOT_STATIONARY_JAW[0, 3])
 # Corners are rounded to a grid, which leaves far fewer of them: 0.1 mm of error at the jaws, 1 mm at the links.
 _JAW_GRID_M, _LINK_GRID_M = 2e-4, 2e-3
 _VISUAL_GRID_M = 8e-4
@@ -23,7 +24,7 @@ _VISUAL_GRID_M = 8e-4
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Region:
-    """A box in the link's frame; what of the mesh lies in it becomes one convex piece."""
+    """A box in the link's frame; the part of the mesh inside becomes one convex piece."""
 
     x: tuple[float, float] = (-1.0, 1.0)
     y: tuple[float, float] = (-1.0, 1.0)
@@ -76,7 +77,7 @@ def load_link_mesh(link: str) -> trimesh.Trimesh:
 
 @cache
 def load_visual_mesh(link: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return vertices (V, 3) [m] and faces (F, 3) of a link for pictures: the mesh without its finest fillets."""
+    """Return vertices (V, 3) [m] and faces (F, 3) of a link for rendering: the mesh without its finest fillets."""
     mesh = load_link_mesh(link)
     cells = np.round(mesh.vertices / _VISUAL_GRID_M).astype(np.int64)
     _, first, cell_of = np.unique(cells, axis=0, return_index=True, return_inverse=True)

@@ -1,4 +1,4 @@
-"""What holds a leaning object until the gripper takes it."""
+"""Break-away fixture that holds a leaning object until the gripper takes it."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ _GRIP_FORCE_N = 1.0
 
 
 class Fixture:
-    """A weld to the world that lets go for good.
+    """A weld to the world that releases once and for all.
 
-    It does so when the arm pushes the object with more than 5 N, when the object has moved 15 mm, or when both jaws
+    It releases when the arm pushes the object with more than 5 N, when the object has moved 15 mm, or when both jaws
     press on it with more than 1 N.
     """
 
@@ -28,7 +28,7 @@ class Fixture:
         self._start = model.body(OBJECT_BODY).pos.copy()
 
     def update(self, model: mujoco.MjModel, data: mujoco.MjData) -> bool:
-        """Let go if it must; return True once it has."""
+        """Release the object if a limit is exceeded; return True once released."""
         moved = np.linalg.norm(data.xpos[self._object] - self._start) > BREAK_TRAVEL_M
         forces = self._forces_by_body(model, data) if not moved else {}
         gripped = all(np.linalg.norm(forces.get(jaw, 0.0)) > _GRIP_FORCE_N for jaw in self._jaws)

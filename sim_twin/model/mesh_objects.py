@@ -1,4 +1,4 @@
-"""A user's mesh as a thing to grasp: read, checked for its size, cut into convex parts by CoACD, kept on disk."""
+"""A user's mesh as a graspable object: parsed, checked for its size, decomposed by CoACD, cached on disk."""
 
 from __future__ import annotations
 
@@ -24,23 +24,23 @@ if TYPE_CHECKING:  # trimesh takes two seconds to import
 
 SUFFIXES = (".stl", ".obj", ".ply", ".off", ".glb")
 SIZE_M = (0.02, 0.35)
-"""Least and most that the longest edge of a mesh's bounding box may measure [m]: what fits the hand and the table."""
+"""Minimum and maximum of the longest edge of a mesh's bounding box [m]: the range that fits gripper and table."""
 MASS_KG = (0.001, 2.0)
-"""Least and most mass [kg]; the Z1 carries 2 kg at most."""
+"""Minimum and maximum mass [kg]; the Z1's payload is 2 kg."""
 _UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "inches": 0.0254, "metres": 1.0}
-# Concavities deeper than 5 % of the size are kept, in 32 parts at most, each of 64 corners: physics stays quick.
+# Concavities deeper than 5 % of the size are kept, in up to 32 parts of up to 64 corners: physics stays quick.
 _COACD = {"threshold": 0.05, "max_convex_hull": 32, "decimate": True, "max_ch_vertex": 64, "seed": 0}
-# What cannot be closed is cut as it is, which fills it: CoACD's own thickening keeps a vessel hollow, but makes so many
-# triangles of it that the cutting takes many minutes.
+# Open meshes are decomposed as they are, which fills them: CoACD's own thickening keeps a vessel hollow, but makes so
+# many triangles of it that the decomposition takes many minutes.
 _COACD_OPEN = {"preprocess_mode": "off", "resolution": 1000, "mcts_iterations": 60}
 _RGBA = (0.36, 0.52, 0.62, 1.0)
 _PUT_DOWN_RAD, _UPRIGHT_RAD, _TRIAL_STEP_S = float(np.deg2rad(2.0)), float(np.deg2rad(6.0)), 1e-3
-_STANDS_ON_M = 1.5e-3
+_FOOT_HEIGHT_M = 1.5e-3
 """Corners this little above the lowest one count as feet: meshes are seldom quite level."""
 
 
 class MeshError(Z1Error, ValueError):
-    """A mesh that cannot be grasped; the message says what was seen and what to do."""
+    """A mesh that cannot be grasped; the message has the value found and the remedy."""
 
     default_code = "mesh"
 
@@ -54,10 +54,14 @@ def load_mesh_object(path: Path, scale: float, mass_kg: float) -> tuple[str, Gra
         mass_kg: of the whole, spread evenly over the parts' volumes.
 
     Raises:
-        MeshError: it is missing or no mesh, or its size or mass is absurd.
+        MeshError: it is missing or no mesh, or its size or mass is out of range.
     """
     if not (MASS_KG[0] <= mass_kg <= MASS_KG[1]):
-        raise MeshError(f"--mass is {mass_kg:g} kg; allowed is {MASS_KG[0]:g} to {MASS_KG[1]:g} kg.")
+        raise MeshError(
+            f"mesh: --mass is out of range ({mass_kg:g} kg, allowed {MASS_KG[0]:g} to {MASS_KG[1]:g} kg). Give the "
+            "object's mass in kilograms.",
+            code="mesh_mass",
+        )
     content = _read(path)
     mesh = _parse(path, content)
     _check_size(path, np.ptp(mesh.vertices, axis=0), scale)
@@ -73,18 +77,23 @@ def cache_folder() -> Path:
 
 def _read(path: Path) -> bytes:
     if path.suffix.lower() not in SUFFIXES:
-        raise MeshError(f"{path} is no mesh by its name; allowed: {', '.join(SUFFIXES)}.")
+        raise MeshError(
+            f"mesh: the file type of {path} is unknown ({path.suffix!r}, allowed {', '.join(SUFFIXES)}). Convert it.",
+            code="mesh_suffix",
+        )
     try:
         return path.read_bytes()
     except OSError as error:
-        raise MeshError(f"the mesh {path} cannot be read: {error.strerror}.") from error
+        raise MeshError(
+            f"mesh: {path} cannot be read ({error.strerror}). Check the path.", code="mesh_unreadable"
+        ) from error
 
 
 def _parse(path: Path, content: bytes) -> trimesh.Trimesh:
     import trimesh
 
     try:
-        # Of an OBJ only the shape counts: its materials would be looked for in other files
+        # Of an OBJ only the shape counts: its materials would be searched in other files
         mesh = trimesh.load(
             trimesh.util.wrap_as_stream(content),
             file_type=path.suffix[1:].lower(),
@@ -92,19 +101,29 @@ def _parse(path: Path, content: bytes) -> trimesh.Trimesh:
             skip_materials=True,
         )
     except Exception as error:  # readers of six formats fail in as many ways
-        raise MeshError(f"{path} cannot be read as {path.suffix[1:].upper()}: {error}") from error
+        raise MeshError(
+            f"mesh: {path} cannot be parsed as {path.suffix[1:].upper()} ({error}). Export it again.",
+            code="mesh_format",
+        ) from error
     if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
-        raise MeshError(f"{path} holds no triangles; a mesh with faces is needed, not a cloud of points or lines.")
+        raise MeshError(
+            f"mesh: {path} has no triangles (0 faces, allowed 1 or more). Export a mesh, not a cloud of points or "
+            "lines.",
+            code="mesh_no_faces",
+        )
     if not np.isfinite(mesh.vertices).all():
-        raise MeshError(f"{path} holds vertices that are not finite; export it anew.")
+        raise MeshError(f"mesh: {path} has vertices that are not finite. Export it again.", code="mesh_not_finite")
     return mesh
 
 
 def _check_size(path: Path, extents: np.ndarray, scale: float) -> None:
-    """Refuse a mesh whose size at `scale` cannot be grasped, with the scales that would make sense."""
+    """Reject a mesh whose size at `scale` cannot be grasped, and suggest scales that fit."""
     low, high = SIZE_M
     if not (np.isfinite(scale) and scale > 0):
-        raise MeshError(f"--scale is {scale:g}; it must be above 0: metres in one of the file's units.")
+        raise MeshError(
+            f"mesh: --scale is invalid ({scale:g}, allowed above 0). Give the metres in one of the file's units.",
+            code="mesh_scale",
+        )
     longest = float(extents.max())
     if low <= scale * longest <= high:
         return
@@ -112,7 +131,9 @@ def _check_size(path: Path, extents: np.ndarray, scale: float) -> None:
     fitting = [f"--scale {unit:g} if it is in {name}" for name, unit in _UNITS.items() if low <= unit * longest <= high]
     advice = f"Give {', or '.join(fitting)}." if fitting else "No usual unit makes it fit; give the --scale that does."
     raise MeshError(
-        f"{path} measures {size} m with --scale {scale:g}; its longest edge must be {low:g} to {high:g} m. {advice}"
+        f"mesh: the size of {path} is out of range ({size} m with --scale {scale:g}, allowed {low:g} to {high:g} m for "
+        f"the longest edge). {advice}",
+        code="mesh_size",
     )
 
 
@@ -145,7 +166,9 @@ def _assemble(path: Path, hulls: list[np.ndarray], mass_kg: float) -> GraspObjec
     bodies = [_hull(hull - middle) for hull in hulls]
     bodies = [body for body in bodies if body is not None]
     if not bodies:
-        raise MeshError(f"{path} is flat: no part of it has a volume; give it a thickness.")
+        raise MeshError(
+            f"mesh: {path} is flat (0 parts with a volume, allowed 1 or more). Give it a thickness.", code="mesh_flat"
+        )
     total = sum(body.volume for body in bodies)
     parts = tuple(
         Part(
@@ -157,8 +180,12 @@ def _assemble(path: Path, hulls: list[np.ndarray], mass_kg: float) -> GraspObjec
         for body in bodies
     )
     centre = np.sum([body.volume * _centroid(body) for body in bodies], axis=0) / total
-    thing = GraspObject(height_m=float(np.ptp(corners[:, 2])), parts=parts)
-    return thing if _has_feet(parts, centre) and _stays_upright(thing) else replace(thing, stands=False)
+    grasp_object = GraspObject(height_m=float(np.ptp(corners[:, 2])), parts=parts)
+    return (
+        grasp_object
+        if _has_feet(parts, centre) and _stays_upright(grasp_object)
+        else replace(grasp_object, is_stable=False)
+    )
 
 
 def _hull(corners: np.ndarray) -> ConvexHull | None:
@@ -179,22 +206,22 @@ def _centroid(body: ConvexHull) -> np.ndarray:
 def _has_feet(parts: tuple[Part, ...], centre: np.ndarray) -> bool:
     """Return whether the centre of mass is above the inside of what touches the table."""
     corners = np.vstack([part.corners() for part in parts])
-    feet = corners[corners[:, 2] < corners[:, 2].min() + _STANDS_ON_M][:, :2]
+    feet = corners[corners[:, 2] < corners[:, 2].min() + _FOOT_HEIGHT_M][:, :2]
     try:
         base = ConvexHull(feet)
     except (QhullError, ValueError):
         return False  # a point or an edge
-    return bool((base.equations[:, :2] @ centre[:2] + base.equations[:, 2] < -_STANDS_ON_M).all())
+    return bool((base.equations[:, :2] @ centre[:2] + base.equations[:, 2] < -_FOOT_HEIGHT_M).all())
 
 
-def _stays_upright(thing: GraspObject) -> bool:
-    """Return whether `thing`, put down a little aslant in either direction, still stands a second later: a round bottom
-    has feet by its corners, and rolls over all the same."""
-    return all(_settled_tilt_rad(thing, axis) < _UPRIGHT_RAD for axis in np.eye(3)[:2])
+def _stays_upright(grasp_object: GraspObject) -> bool:
+    """Return whether `grasp_object`, put down a little tilted in either direction, is upright a second later: a
+    round bottom has feet by its corners, and rolls over all the same."""
+    return all(_settled_tilt_rad(grasp_object, axis) < _UPRIGHT_RAD for axis in np.eye(3)[:2])
 
 
-def _settled_tilt_rad(thing: GraspObject, axis: np.ndarray) -> float:
-    """Return how far `thing` leans [rad] after a second on a table where it began turned about `axis` (3,)."""
+def _settled_tilt_rad(grasp_object: GraspObject, axis: np.ndarray) -> float:
+    """Return how far `grasp_object` leans [rad] after a second on a table where it began turned about `axis` (3,)."""
     spec = mujoco.MjSpec()
     spec.option.timestep = _TRIAL_STEP_S
     spec.worldbody.add_geom(
@@ -202,8 +229,8 @@ def _settled_tilt_rad(thing: GraspObject, axis: np.ndarray) -> float:
     )
     start = np.eye(4)
     start[:3, :3] = Rotation.from_rotvec(_PUT_DOWN_RAD * axis).as_matrix()
-    start[2, 3] = -float((thing.corners() @ start[2, :3]).min())
-    add_object(spec, thing, start)
+    start[2, 3] = -float((grasp_object.corners() @ start[2, :3]).min())
+    add_object(spec, grasp_object, start)
     model = spec.compile()
     data = mujoco.MjData(model)
     mujoco.mj_step(model, data, nstep=round(1.0 / _TRIAL_STEP_S))

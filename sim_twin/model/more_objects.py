@@ -1,13 +1,13 @@
-"""Things to grasp that the paper has not: hollow, thin, leaning, with handles; each stands by itself.
+"""Graspable objects that the paper does not have: hollow, thin, leaning, with handles; each is stable upright.
 
-Every one has a place that the jaws (65 mm) can take, though for some it is only a rim, a neck or a handle.
+Every one has a place that the jaws (65 mm) can grasp, though for some it is only a rim, a neck or a handle.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from sim_twin.model.parts import GraspObject, Part, Rgba, turned, wall
+from sim_twin.model.parts import GraspObject, Part, Rgba, make_homogeneous_lathe, make_wall
 
 _CLAY, _STEEL, _GREEN, _GLASS = (
     (0.80, 0.76, 0.68, 1.0),
@@ -43,7 +43,7 @@ def _vessel(
     half = height_m / 2
     return (
         _disc(foot_m, (-half, -half + thick_m), masses_kg[0], rgba),
-        *wall((foot_m - thick_m, foot_m), (rim_m - thick_m, rim_m), (-half + thick_m, half), masses_kg[1], rgba),
+        *make_wall((foot_m - thick_m, foot_m), (rim_m - thick_m, rim_m), (-half + thick_m, half), masses_kg[1], rgba),
     )
 
 
@@ -68,7 +68,7 @@ _BALL_RADIUS_M, _BALL_FLAT_M = 0.031, 0.012
 
 
 def _ball_profile() -> tuple[tuple[float, float], ...]:
-    """Return a sphere that lies on a flat, as a lathe's profile."""
+    """Return the profile of a sphere with a flat foot."""
     foot = np.sqrt(_BALL_RADIUS_M**2 - _BALL_FLAT_M**2)
     heights = np.linspace(-foot, 0.998 * _BALL_RADIUS_M, 13)
     return tuple((float(z + foot), float(np.sqrt(_BALL_RADIUS_M**2 - z * z))) for z in heights)
@@ -77,8 +77,8 @@ def _ball_profile() -> tuple[tuple[float, float], ...]:
 _HEXAGON = 0.030 * np.array([[np.cos(a), np.sin(a)] for a in np.arange(6) * np.pi / 3])
 
 EXTENDED: dict[str, GraspObject] = {
-    # A juggling ball: leather round millet, which lies on a flat of its own weight's making and so does not roll.
-    "ball": GraspObject(height_m=_ball_profile()[-1][0], parts=turned(_ball_profile(), 0.13, _RED)),
+    # A juggling ball: leather around millet; its weight flattens the foot, so that it does not roll.
+    "ball": GraspObject(height_m=_ball_profile()[-1][0], parts=make_homogeneous_lathe(_ball_profile(), 0.13, _RED)),
     # A cereal bowl of melamine: 110 mm at the rim, too wide for the jaws; 4 mm of wall can be taken.
     "bowl": GraspObject(
         height_m=0.055, parts=_vessel(0.030, 0.055, 0.055, thick_m=0.004, masses_kg=(0.05, 0.13), rgba=_GREEN)
@@ -86,10 +86,10 @@ EXTENDED: dict[str, GraspObject] = {
     # A slim quarter-litre can, full.
     "can": GraspObject(
         height_m=0.135,
-        parts=turned(((0.0, 0.0235), (0.006, 0.0265), (0.124, 0.0265), (0.135, 0.0235)), 0.27, _STEEL),
+        parts=make_homogeneous_lathe(((0.0, 0.0235), (0.006, 0.0265), (0.124, 0.0265), (0.135, 0.0235)), 0.27, _STEEL),
     ),
     # A turned skittle's upper end: nothing on it is upright.
-    "cone": GraspObject(height_m=0.100, parts=turned(((0.0, 0.032), (0.100, 0.010)), 0.12, _YELLOW)),
+    "cone": GraspObject(height_m=0.100, parts=make_homogeneous_lathe(((0.0, 0.032), (0.100, 0.010)), 0.12, _YELLOW)),
     # A tumbler of thick plastic, empty: light, so that a touch moves it.
     "cup": GraspObject(
         height_m=0.090, parts=_vessel(0.024, 0.031, 0.090, thick_m=0.003, masses_kg=(0.015, 0.055), rgba=_BLUE)
@@ -97,7 +97,7 @@ EXTENDED: dict[str, GraspObject] = {
     # Turned wood; the 16 mm stem is the best hold, the head the widest.
     "goblet": GraspObject(
         height_m=0.130,
-        parts=turned(
+        parts=make_homogeneous_lathe(
             ((0.0, 0.032), (0.010, 0.030), (0.016, 0.008), (0.070, 0.008), (0.090, 0.026), (0.130, 0.030)),
             0.15,
             _WOOD,
@@ -119,7 +119,7 @@ EXTENDED: dict[str, GraspObject] = {
             _box((0.030, 0.030, 0.080), (0.0, -0.030, 0.015), 0.050, _WOOD),
         ),
     ),
-    # A small stoneware mug; the handle stands across the view.
+    # A small stoneware mug; the handle is across the view.
     "mug": GraspObject(
         height_m=0.080,
         parts=(
@@ -130,7 +130,7 @@ EXTENDED: dict[str, GraspObject] = {
     # A ripe pear: 0.95 kg/l.
     "pear": GraspObject(
         height_m=0.095,
-        parts=turned(
+        parts=make_homogeneous_lathe(
             (
                 (0.0, 0.014),
                 (0.008, 0.025),
@@ -160,9 +160,9 @@ EXTENDED: dict[str, GraspObject] = {
             _box((0.008, 0.014, 0.035), (-0.034, 0.0, 0.0475), 0.003, _RED),
         ),
     ),
-    # Parcel tape on its core, lying: 90 mm across, the ring 17 mm thick.
+    # Parcel tape on its core, flat on the table: 90 mm across, the ring 17 mm thick.
     "tape_roll": GraspObject(
-        height_m=0.048, parts=wall((0.028, 0.045), (0.028, 0.045), (-0.024, 0.024), 0.16, _YELLOW)
+        height_m=0.048, parts=make_wall((0.028, 0.045), (0.028, 0.045), (-0.024, 0.024), 0.16, _YELLOW)
     ),
     # A toy builder's ramp of beech, its slope towards the robot.
     "wedge": GraspObject(

@@ -1,4 +1,4 @@
-"""Convex parts that a thing is made of, and the ways to make many of them at once."""
+"""Convex parts of an object, and functions that make many of them at once."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ class Part:
     z_m: float = 0.0
     """Height of the part's middle."""
     xy_m: tuple[float, float] = (0.0, 0.0)
-    """Where its middle is beside the object's axis."""
+    """Offset of its middle from the object's axis."""
     mass_kg: float
-    """Share of the object's mass; with the shape it gives the inertia (homogeneous part)."""
+    """Mass; with the shape it gives the inertia (homogeneous part)."""
     rgba: Rgba
 
     @property
@@ -70,8 +70,8 @@ class GraspObject:
 
     height_m: float
     parts: tuple[Part, ...]
-    stands: bool = True
-    """Upright it stands by itself; what does not is held by a break-away fixture in every pose."""
+    is_stable: bool = True
+    """Stable upright; an unstable object is held by a break-away fixture in every pose."""
 
     @property
     def mass_kg(self) -> float:
@@ -82,7 +82,7 @@ class GraspObject:
         return np.vstack([part.corners() for part in self.parts])
 
 
-def lathe(profile: tuple[tuple[float, float], ...], parts: tuple[tuple[float, tuple], ...]) -> tuple[Part, ...]:
+def make_lathe(profile: tuple[tuple[float, float], ...], parts: tuple[tuple[float, tuple], ...]) -> tuple[Part, ...]:
     """Return one part per segment of a profile of (height, radius) [m], heights from the foot.
 
     Args:
@@ -97,13 +97,13 @@ def lathe(profile: tuple[tuple[float, float], ...], parts: tuple[tuple[float, tu
     return tuple(made)
 
 
-def turned(profile: tuple[tuple[float, float], ...], mass_kg: float, rgba: Rgba) -> tuple[Part, ...]:
-    """Return the parts of a `lathe` profile that is one stuff throughout: each weighs by its volume."""
+def make_homogeneous_lathe(profile: tuple[tuple[float, float], ...], mass_kg: float, rgba: Rgba) -> tuple[Part, ...]:
+    """Return the parts of a `make_lathe` profile of one material: masses in proportion to volumes."""
     volumes = np.array([(z1 - z0) * (r0 * r0 + r0 * r1 + r1 * r1) for (z0, r0), (z1, r1) in pairwise(profile)])
-    return lathe(profile, tuple((float(share), rgba) for share in mass_kg * volumes / volumes.sum()))
+    return make_lathe(profile, tuple((float(mass), rgba) for mass in mass_kg * volumes / volumes.sum()))
 
 
-def wall(
+def make_wall(
     low: tuple[float, float], high: tuple[float, float], z_m: tuple[float, float], mass_kg: float, rgba: Rgba
 ) -> tuple[Part, ...]:
     """Return a round wall open above and below, as staves with no gaps between them.

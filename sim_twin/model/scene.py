@@ -1,4 +1,4 @@
-"""What stands where: one validated description of a scene, and the MuJoCo model made from it."""
+"""One validated description of a scene, and the MuJoCo model made from it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from hal.base.errors import InvalidValueError
 from sim_twin.model.charuco_board import BoardSpec, add_board
 from sim_twin.model.objects import OBJECT_BODY, OBJECT_NAMES, OBJECTS, add_object
 from sim_twin.model.parts import GraspObject
-from sim_twin.model.z1_mjcf import BIT_BASE, BIT_HAND, BIT_SCENE, CONTACT_SOLIMP, CONTACT_SOLREF, GROUP_SCENE, add_z1
+from sim_twin.model.z1_mjcf import BIT_BASE, BIT_GRIPPER, BIT_SCENE, CONTACT_SOLIMP, CONTACT_SOLREF, GROUP_SCENE, add_z1
 
 PHYSICS_PERIOD_S = z1.CONTROL_PERIOD_S / 2
 """Two physics steps in a control period: contacts of 4 ms time constant need steps of 2 ms or less [s]."""
@@ -29,26 +29,26 @@ _PITCH_DEG = (-60.0, 60.0)
 _MOUNT_ERROR_M, _MOUNT_ERROR_DEG = (0.0, 0.02), (0.0, 10.0)
 _FACTOR = (0.1, 10.0)
 _ARM_LATENCY_S = (0.0, 0.1)
-_ASIDE_M = (0.90, -0.50)  # where the object stands, out of reach, when there is a board
+_PARKED_XY_M = (0.90, -0.50)  # the object's place out of reach, when there is a board
 _TABLE_FRICTION = (0.4, 0.005, 0.0001)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Neighbour:
-    """Something that stands upright beside the object.
+    """An upright object next to the one to grasp.
 
     Raises:
-        ValueError: there is no such object.
+        InvalidValueError: there is no such object.
     """
 
     object: str
     """One of `sim_twin.model.objects.OBJECT_NAMES`."""
     x_m: float
-    """Of its origin along base x."""
+    """Its origin along base x [m]."""
     y_m: float
-    """The same along base y."""
+    """Its origin along base y [m]."""
     yaw_deg: float = 0.0
-    """Turn about base z."""
+    """Turn about base z [°]."""
 
     def __post_init__(self) -> None:
         _check_object(self.object)
@@ -66,39 +66,39 @@ class SceneConfig:
     """One object, maybe among neighbours, on the table in front of the arm; or a calibration board.
 
     Raises:
-        ValueError: a field is out of its range; the message says what is allowed.
+        InvalidValueError: a field is out of its range; the message names the range.
     """
 
     object: str = "bottle"
-    """One of `sim_twin.model.objects.OBJECT_NAMES`, or the name of `shape`."""
+    """Object on the table: a name from `sim_twin.model.objects.OBJECT_NAMES`, or the name of `shape`."""
     shape: GraspObject | None = None
-    """The object itself, where it is none of the named ones."""
+    """Shape of an object that is none of the named ones."""
     distance_m: float = 0.48
-    """Of the object's origin (mid-height on its axis) from the base, along base x."""
+    """Object's distance from the base along base x [m], at mid-height on its axis; 0.3 to 0.65."""
     lateral_m: float = 0.0
-    """The same along base y."""
+    """Object's offset along base y [m], positive to the left; −0.25 to 0.25."""
     pitch_deg: float = 0.0
-    """Lean about base y, positive away from the base; other than 0 a break-away fixture holds the object."""
+    """Object's lean about base y [°], positive from the base outwards; −60 to 60. A fixture holds a leaning object."""
     seed: int = 0
-    """Of the camera's noise."""
+    """Seed of the camera's noise."""
     noise: bool = True
-    """False gives exact depth (rounded to its unit) and clean colour."""
+    """Simulate the camera's noise; without it depth is exact (rounded to its unit) and colour clean."""
     board: BoardSpec | None = None
-    """A calibration board on the table; the object then stands aside."""
+    """Calibration board on the table; the object is then out of reach."""
     mount_error_m: float = 0.0
-    """How far the camera really sits from where the mount's drawing has it [m]; only a calibration finds out."""
+    """Offset of the camera from the mount's drawing [m], 0 to 0.02; only a calibration can find it."""
     mount_error_deg: float = 0.0
-    """How far it is really turned [°]."""
+    """Turn of the camera from the mount's drawing [°], 0 to 10."""
     mount_seed: int = 0
-    """Of the direction of both."""
+    """Seed of the directions of both mount errors."""
     neighbours: tuple[Neighbour, ...] = ()
-    """What stands on the table besides."""
+    """Further objects on the table."""
     friction_factor: float = 1.0
-    """Every surface's friction over what it should be."""
+    """Friction of every surface relative to its nominal value; 0.1 to 10."""
     mass_factor: float = 1.0
-    """The object's mass over what it should be."""
+    """Object's mass relative to its nominal value; 0.1 to 10."""
     arm_latency_s: float = 0.0
-    """How late the arm does what it is told, rounded to control periods [s]."""
+    """Latency of the arm's motions [s], 0 to 0.1, rounded to control periods."""
 
     def __post_init__(self) -> None:
         if self.shape is None:
@@ -106,25 +106,29 @@ class SceneConfig:
         _check_range("distance_m", self.distance_m, _DISTANCE_M, "m in front of the base")
         _check_range("lateral_m", self.lateral_m, _LATERAL_M, "m to the side")
         _check_range("pitch_deg", self.pitch_deg, _PITCH_DEG, "degrees of lean")
-        _check_range("mount_error_m", self.mount_error_m, _MOUNT_ERROR_M, "m", "allowed is")
-        _check_range("mount_error_deg", self.mount_error_deg, _MOUNT_ERROR_DEG, "degrees", "allowed is")
-        _check_range("friction_factor", self.friction_factor, _FACTOR, "times the usual", "allowed is")
-        _check_range("mass_factor", self.mass_factor, _FACTOR, "times the usual", "allowed is")
-        _check_range("arm_latency_s", self.arm_latency_s, _ARM_LATENCY_S, "s", "allowed is")
+        _check_range("mount_error_m", self.mount_error_m, _MOUNT_ERROR_M, "m")
+        _check_range("mount_error_deg", self.mount_error_deg, _MOUNT_ERROR_DEG, "degrees")
+        _check_range("friction_factor", self.friction_factor, _FACTOR, "times the usual")
+        _check_range("mass_factor", self.mass_factor, _FACTOR, "times the usual")
+        _check_range("arm_latency_s", self.arm_latency_s, _ARM_LATENCY_S, "s")
         for name in ("seed", "mount_seed"):
             seed = getattr(self, name)
             if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**32:
-                raise InvalidValueError(f"{name} is {seed!r}; allowed is a whole number from 0 to {2**32 - 1}.")
+                raise InvalidValueError(
+                    f"scene: {name} is invalid ({seed!r}, allowed whole numbers from 0 to {2**32 - 1}). Give such "
+                    "a seed.",
+                    code="scene_seed",
+                )
 
     @property
-    def thing(self) -> GraspObject:
-        """What the object is."""
+    def grasp_object(self) -> GraspObject:
+        """The object's shape."""
         return OBJECTS[self.object] if self.shape is None else self.shape
 
     @property
     def is_held(self) -> bool:
-        """Whether a break-away fixture holds the object: it leans, or cannot stand."""
-        return self.pitch_deg != 0 or not self.thing.stands
+        """True where a break-away fixture holds the object: it leans, or is unstable upright."""
+        return self.pitch_deg != 0 or not self.grasp_object.is_stable
 
     def T_base_object(self) -> np.ndarray:
         """Return the object's pose (4, 4) at the start, its lowest point on the table."""
@@ -132,13 +136,13 @@ class SceneConfig:
         c, s = np.cos(pitch), np.sin(pitch)
         pose = np.eye(4)
         pose[:3, :3] = [[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]]
-        lowest = (self.thing.corners() @ pose[2, :3]).min()
-        where = _ASIDE_M if self.board is not None else (self.distance_m, self.lateral_m)
+        lowest = (self.grasp_object.corners() @ pose[2, :3]).min()
+        where = _PARKED_XY_M if self.board is not None else (self.distance_m, self.lateral_m)
         pose[:3, 3] = [*where, -lowest]
         return pose
 
     def T_flange_camera(self) -> np.ndarray:
-        """Return where the camera really is on the flange (4, 4)."""
+        """Return the camera's true pose on the flange (4, 4)."""
         shift, turn = np.random.default_rng(self.mount_seed).normal(size=(2, 3))
         pose = z1.T_FLANGE_CAMERA.copy()
         pose[:3, 3] += self.mount_error_m * shift / np.linalg.norm(shift)
@@ -147,7 +151,7 @@ class SceneConfig:
         return pose
 
     def camera_serial(self) -> str:
-        """Return the camera's serial number: one per mount, so that no calibration is taken for another's."""
+        """Return the camera's serial number: one per mount, so that no calibration is used for another mount."""
         if not (self.mount_error_m or self.mount_error_deg):
             return "twin"
         return f"twin-{1e3 * self.mount_error_m:g}mm-{self.mount_error_deg:g}deg-{self.mount_seed}"
@@ -155,14 +159,19 @@ class SceneConfig:
 
 def _check_object(name: str) -> None:
     if name not in OBJECT_NAMES:
-        raise InvalidValueError(f"there is no object {name!r}; choose one of: {', '.join(OBJECT_NAMES)}.")
+        raise InvalidValueError(
+            f"scene: the object is unknown ({name!r}, allowed {', '.join(OBJECT_NAMES)}). Choose one of these.",
+            code="unknown_object",
+        )
 
 
-def _check_range(
-    name: str, value: float, allowed: tuple[float, float], what: str, why: str = "the arm reaches"
-) -> None:
+def _check_range(name: str, value: float, allowed: tuple[float, float], unit: str) -> None:
     if not (isinstance(value, int | float) and allowed[0] <= value <= allowed[1]):  # NaN fails too
-        raise InvalidValueError(f"{name} is {value!r}; {why} {allowed[0]:g} to {allowed[1]:g} {what}.")
+        raise InvalidValueError(
+            f"scene: {name} is out of range ({value!r}, allowed {allowed[0]:g} to {allowed[1]:g} {unit}). Give a value "
+            "within the range.",
+            code="scene_range",
+        )
 
 
 def neighbour_body(number: int) -> str:
@@ -184,7 +193,7 @@ def _compile(config: SceneConfig) -> mujoco.MjModel:
     add_z1(spec, config.T_flange_camera())
     if config.board is not None:
         add_board(spec, config.board)
-    add_object(spec, config.thing, config.T_base_object(), mass_factor=config.mass_factor)
+    add_object(spec, config.grasp_object, config.T_base_object(), mass_factor=config.mass_factor)
     for number, neighbour in enumerate(config.neighbours):
         add_object(spec, OBJECTS[neighbour.object], neighbour.T_base_object(), name=neighbour_body(number))
     if config.is_held:
@@ -257,7 +266,7 @@ def _add_surroundings(spec: mujoco.MjSpec) -> None:
         pos=[0.35, 0.0, -0.02],
         size=[0.65, 0.60, 0.02],
         contype=BIT_SCENE,
-        conaffinity=BIT_SCENE | BIT_BASE | BIT_HAND,
+        conaffinity=BIT_SCENE | BIT_BASE | BIT_GRIPPER,
         friction=_TABLE_FRICTION,
         solref=CONTACT_SOLREF,
         solimp=CONTACT_SOLIMP,

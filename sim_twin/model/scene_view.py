@@ -1,4 +1,4 @@
-"""What can be read of a scene at a moment, wherever its physics run."""
+"""Read access to a scene at a moment, wherever its physics run."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ class SceneView(ABC):
     """A scene's poses: of a world in this process, or of another's.
 
     Args:
-        config: what stands where.
+        config: of the scene.
     """
 
     start_height_m: float
-    """Where the object's lowest point was at the start [m]."""
+    """Height of the object's lowest point at the start [m]."""
 
     def __init__(self, config: SceneConfig) -> None:
         self.config = config
-        self._corners = config.thing.corners()
+        self._corners = config.grasp_object.corners()
 
     @property
     @abstractmethod
     def model(self) -> mujoco.MjModel:
-        """What MuJoCo computes with."""
+        """MuJoCo's model of the scene."""
 
     @abstractmethod
     def poses(self) -> tuple[float, np.ndarray]:
@@ -44,7 +44,7 @@ class SceneView(ABC):
         return pose
 
     def lifted_m(self) -> float:
-        """Return how much higher the object's lowest point is than at the start [m]."""
+        """Return the rise of the object's lowest point since the start [m]."""
         return self.lowest_m() - self.start_height_m
 
     def lowest_m(self) -> float:

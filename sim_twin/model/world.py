@@ -14,9 +14,9 @@ from sim_twin.model.scene_view import SceneView
 
 GRIPPER_START_RAD = -1.0
 KP_MOTOR_MAX, KD_MOTOR_MAX = 1e4, 1e3
-"""What a motor's gains are cut to [Nm/rad], [Nm s/rad]: thirteen times the vendor's highest, and more."""
+"""Limits of a motor's gains [Nm/rad], [Nm s/rad]: thirteen times the vendor's highest, and more."""
 _CTRL_MAX = 1e9
-"""MuJoCo takes 1e10 for a mistake; the effort limit is met long before."""
+"""MuJoCo rejects 1e10 as a mistake; the effort limit is far below."""
 _SUBSTEPS = round(z1.CONTROL_PERIOD_S / PHYSICS_PERIOD_S)
 _SETTLE_STEPS = 100
 
@@ -27,8 +27,8 @@ class World(SceneView):
     The arm starts at home with the jaws open by 1 rad; the object has settled.
 
     Args:
-        config: what stands where.
-        q_start: (7,) where the arm starts instead [rad].
+        config: of the scene.
+        q_start: (7,) start of the arm, by default home [rad].
     """
 
     def __init__(self, config: SceneConfig, q_start: np.ndarray | None = None) -> None:
@@ -50,7 +50,7 @@ class World(SceneView):
 
     @property
     def model(self) -> mujoco.MjModel:
-        """What MuJoCo computes with."""
+        """MuJoCo's model of the scene."""
         return self._model
 
     @property
@@ -72,7 +72,7 @@ class World(SceneView):
             self.step()
 
     def set_command(self, q: np.ndarray, dq: np.ndarray) -> None:
-        """Set where the servos pull to: positions (7,) [rad] and velocities (7,) [rad/s]."""
+        """Set the servos' targets: positions (7,) [rad] and velocities (7,) [rad/s]."""
         with self._lock:
             self._set_servos(z1.KP, z1.KD, self._gravcomp)
             self.data.ctrl[:] = z1.KP * q + z1.KD * dq
@@ -87,8 +87,8 @@ class World(SceneView):
         *,
         tau_max: np.ndarray = z1.TAU_MAX,
     ) -> None:
-        """Let each motor make tau + kp · (q − q_measured) + kd · (dq − dq_measured), up to its effort limit; nothing
-        carries the arm besides.
+        """Let each motor make tau + kp · (q − q_measured) + kd · (dq − dq_measured), up to its effort limit, without
+        gravity compensation.
 
         Args:
             q: (7,) [rad].
@@ -124,5 +124,5 @@ class World(SceneView):
 
     @property
     def fixture_holds(self) -> bool:
-        """True while the break-away fixture of a leaning object has not let go."""
+        """True while the break-away fixture of a leaning object has not released it."""
         return self._fixture is not None

@@ -1,27 +1,30 @@
-"""The Z1 and its beak gripper as a MuJoCo specification, built from the URDF and STL files of `example-robot-data`."""
+"""The Z1 and its gripper as a MuJoCo specification, built from its rigid-body model and its STL files."""
 
 from __future__ import annotations
 
-from xml.etree import ElementTree
+from collections.abc import Iterator
+from dataclasses import dataclass
 
 import mujoco
 import numpy as np
+import pinocchio as pin  # pyright: ignore[reportMissingImports] - a .pth file leads to it
 
 from hal.base import z1
+from hal.base.z1_model import rigid_body_model
 from sim_twin.model.convex import JAW_LINKS, load_visual_mesh, split_convex
 
 GROUP_SCENE = 0
-"""Table and object: seen by every camera, collides."""
+"""Table and object: visible to every camera, collides."""
 GROUP_VISUAL = 1
-"""The arm's full meshes: seen from outside only."""
+"""The arm's full meshes: visible from outside only."""
 GROUP_ARM = 3
-"""The arm's convex pieces: they collide, and the wrist camera sees them (within 0.6 mm of the mesh at the jaws)."""
+"""The arm's convex pieces: they collide and are visible to the wrist camera (within 0.6 mm of the mesh at the jaws)."""
 GROUP_MOUNT = 4
-"""Camera housing and bracket: seen from outside only, as the lens sits behind its own glass."""
+"""Camera housing and bracket: visible from outside only, as the lens is behind its own glass."""
 
 # Collision classes: `contype`, `conaffinity`. Upper arm and forearm do not collide with each other: the vendor's joint
 # limits keep them apart, and their hulls overlap at the joints.
-BIT_SCENE, BIT_BASE, BIT_HAND = 1, 2, 4
+BIT_SCENE, BIT_BASE, BIT_GRIPPER = 1, 2, 4
 
 JAW_FRICTION = (1.0, 0.01, 0.001)
 """Sliding [1], torsional [m], rolling [m]. Rubber pad on plastic or card: 0.8 to 1.2 in tables of friction; torsional:
@@ -36,13 +39,25 @@ more than the real arm's repeatability; the gripper's 1.0 Nm would be a third of
 ARMATURE = (0.02, 0.04, 0.02, 0.02, 0.02, 0.02, 0.005)
 """(7,) inertia of the rotors behind their gears [kg m²]: not published; of the size of geared drives of 30 Nm."""
 
+_DECIMALS = 9
+"""Decimals of the URDF's lengths, masses and inertias, 8 at most: rounding undoes what pinocchio lost in adding the
+fixed links up, so that the model is the URDF's to the last bit."""
 _HOUSING_MASS_KG = 0.060
 _BRACKET_MASS_KG = 0.040
 _LINK_RGBA = {"link": (0.80, 0.83, 0.87, 1.0), "dark": (0.16, 0.18, 0.22, 1.0), "jaw": (0.13, 0.14, 0.16, 1.0)}
 
 
-def _vector(text: str) -> np.ndarray:
-    return np.array([float(part) for part in text.split()])
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Link:
+    """One URDF link, in its parent's frame at joint angle 0."""
+
+    name: str
+    parent: str
+    position_m: np.ndarray
+    inertia: pin.Inertia
+    axis: np.ndarray | None
+    """(3,) of the joint that moves it; None where it is fixed."""
+    damping: float
 
 
 def add_z1(spec: mujoco.MjSpec, T_flange_camera: np.ndarray = z1.T_FLANGE_CAMERA) -> None:
@@ -55,22 +70,15 @@ def add_z1(spec: mujoco.MjSpec, T_flange_camera: np.ndarray = z1.T_FLANGE_CAMERA
     Raises:
         FileNotFoundError: the wheel with the description is not installed.
     """
-    root = ElementTree.parse(z1.urdf_path()).getroot()
-    links = {element.get("name", ""): element for element in root.findall("link")}
-    joints = [joint for joint in root.findall("joint") if joint.find("parent") is not None]
     bodies = {"world": spec.worldbody}
     index = 0
-    for joint in joints:  # the URDF lists parents before children
-        origin, parent, child = joint.find("origin"), joint.find("parent"), joint.find("child")
-        assert origin is not None and parent is not None and child is not None
-        assert not _vector(origin.get("rpy", "0 0 0")).any()
-        name = child.get("link", "")
-        body = bodies[parent.get("link", "")].add_body(name=name, pos=_vector(origin.get("xyz", "0 0 0")), gravcomp=1.0)
-        bodies[name] = body
-        _set_inertia(body, links[name])
-        _add_geoms(spec, body, name)
-        if joint.get("type") == "revolute":
-            _add_joint(body, joint, index)
+    for link in _links(rigid_body_model()):
+        body = bodies[link.parent].add_body(name=link.name, pos=link.position_m, gravcomp=1.0)
+        bodies[link.name] = body
+        _set_inertia(body, link.inertia)
+        _add_geoms(spec, body, link.name)
+        if link.axis is not None:
+            _add_joint(body, link, index)
             _add_servo(spec, index)
             index += 1
     spec.add_exclude(name="jaws", bodyname1="gripperStator", bodyname2="gripperMover")
@@ -78,30 +86,55 @@ def add_z1(spec: mujoco.MjSpec, T_flange_camera: np.ndarray = z1.T_FLANGE_CAMERA
     _add_mount(bodies["link06"], T_flange_camera)
 
 
-def _set_inertia(body: mujoco.MjsBody, link: ElementTree.Element) -> None:
-    inertial = link.find("inertial")
-    assert inertial is not None
-    origin, mass, inertia = inertial.find("origin"), inertial.find("mass"), inertial.find("inertia")
-    assert origin is not None and mass is not None and inertia is not None
+def _links(model: pin.Model) -> Iterator[_Link]:
+    """Yield the links of `model` from the base outwards."""
+    for frame in model.frames:
+        if frame.type != pin.FrameType.BODY or frame.name == "world":
+            continue
+        joint_frame = model.frames[frame.parentFrame]
+        parent = model.frames[joint_frame.parentFrame]
+        moved = joint_frame.type == pin.FrameType.JOINT
+        T_joint_link = model.jointPlacements[frame.parentJoint] if moved else frame.placement
+        T_parent_link = parent.placement.inverse() * T_joint_link
+        assert np.array_equal(T_parent_link.rotation, np.eye(3)), "the Z1's links are all parallel at angle 0"
+        yield _Link(
+            name=frame.name,
+            parent=parent.name,
+            position_m=T_parent_link.translation.round(_DECIMALS),
+            inertia=_own_inertia(model, frame.parentJoint) if moved else joint_frame.inertia,
+            axis=np.eye(3)["XYZ".index(model.joints[frame.parentJoint].shortname()[-1])] if moved else None,
+            damping=float(model.damping[frame.parentJoint - 1]) if moved else 0.0,
+        )
+
+
+def _own_inertia(model: pin.Model, joint: int) -> pin.Inertia:
+    """Return the inertia of the link that `joint` moves, without the fixed links that pinocchio added to it."""
+    inertia = model.inertias[joint]
+    for frame in model.frames:
+        if frame.parentJoint == joint and frame.type == pin.FrameType.FIXED_JOINT:
+            inertia = inertia - frame.placement.act(frame.inertia)
+    return inertia
+
+
+def _set_inertia(body: mujoco.MjsBody, inertia: pin.Inertia) -> None:
     body.explicitinertial = True
-    body.mass = float(mass.get("value", "nan"))
-    body.ipos = _vector(origin.get("xyz", "0 0 0"))
-    body.fullinertia = [float(inertia.get(key, "nan")) for key in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")]
+    body.mass = round(inertia.mass, _DECIMALS)
+    body.ipos = inertia.lever.round(_DECIMALS)
+    (ixx, ixy, ixz), (_, iyy, iyz), (_, _, izz) = inertia.inertia
+    body.fullinertia = [round(float(value), _DECIMALS) for value in (ixx, iyy, izz, ixy, ixz, iyz)]
 
 
-def _add_joint(body: mujoco.MjsBody, joint: ElementTree.Element, index: int) -> None:
-    axis, dynamics = joint.find("axis"), joint.find("dynamics")
-    assert axis is not None and dynamics is not None
+def _add_joint(body: mujoco.MjsBody, link: _Link, index: int) -> None:
     body.add_joint(
         name=z1.JOINT_NAMES[index],
         type=mujoco.mjtJoint.mjJNT_HINGE,
-        axis=_vector(axis.get("xyz", "0 0 1")),
+        axis=link.axis,
         limited=True,
         range=[z1.Q_MIN[index], z1.Q_MAX[index]],
-        damping=[float(dynamics.get("damping", "0")), 0.0, 0.0],
+        damping=[link.damping, 0.0, 0.0],
         frictionloss=FRICTIONLOSS[index],
         armature=ARMATURE[index],
-        # Gravity compensation is part of the motor's torque, as in the vendor's controller, and shares its limit.
+        # Gravity compensation is part of the motor's torque, as in the vendor's controller, and within its limit.
         actgravcomp=True,
         actfrclimited=True,
         actfrcrange=[-z1.TAU_MAX[index], z1.TAU_MAX[index]],
@@ -139,7 +172,7 @@ def _add_geoms(spec: mujoco.MjSpec, body: mujoco.MjsBody, name: str) -> None:
         conaffinity=0,
         material=colour,
     )
-    hand = jaw or name in ("link05", "link06")
+    is_gripper = jaw or name in ("link05", "link06")
     for number, corners in enumerate(split_convex(name)):
         piece = spec.add_mesh(name=f"{name}_{number}", smoothnormal=False)
         piece.uservert = corners.ravel()
@@ -148,8 +181,8 @@ def _add_geoms(spec: mujoco.MjSpec, body: mujoco.MjsBody, name: str) -> None:
             type=mujoco.mjtGeom.mjGEOM_MESH,
             meshname=piece.name,
             group=GROUP_ARM,
-            contype=BIT_HAND if hand else BIT_BASE,
-            conaffinity=BIT_SCENE | (BIT_BASE if hand else BIT_HAND),
+            contype=BIT_GRIPPER if is_gripper else BIT_BASE,
+            conaffinity=BIT_SCENE | (BIT_BASE if is_gripper else BIT_GRIPPER),
             condim=6 if jaw else 3,
             priority=1 if jaw else 0,
             friction=JAW_FRICTION if jaw else (0.3, 0.005, 0.0001),
@@ -166,7 +199,7 @@ def _add_mount(flange: mujoco.MjsBody, pose: np.ndarray) -> None:
     camera = flange.add_body(name="camera", pos=pose[:3, 3], quat=quat, gravcomp=1.0)
     common = {
         "group": GROUP_MOUNT,
-        "contype": BIT_HAND,
+        "contype": BIT_GRIPPER,
         "conaffinity": BIT_SCENE | BIT_BASE,
         "type": mujoco.mjtGeom.mjGEOM_BOX,
     }
@@ -191,5 +224,5 @@ def _add_mount(flange: mujoco.MjsBody, pose: np.ndarray) -> None:
         material="bracket",
         **common,
     )
-    # MuJoCo cameras look along −z with y up: half a turn about x from the optical frame.
+    # MuJoCo's cameras point along −z with y up: half a turn about x from the optical frame.
     camera.add_camera(name="wrist", quat=[0.0, 1.0, 0.0, 0.0])

@@ -30,5 +30,5 @@ def test_time_is_a_whole_number_of_periods_however_it_was_slept() -> None:
 def test_a_tick_function_that_sleeps_is_told_off() -> None:
     clock = TwinClock(World(SceneConfig(object="cylinder")))
     clock.call_every_tick(lambda: clock.sleep_until(1.0))
-    with pytest.raises(RuntimeError, match="must return at once"):
+    with pytest.raises(RuntimeError):
         clock.sleep_until(0.1)

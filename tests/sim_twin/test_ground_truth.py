@@ -17,6 +17,7 @@ from hal.bus.session import BusConfig
 from hal.servo.servo import Servo
 from sim_twin.ground_truth import GroundTruthClient, GroundTruthServer, read_ground_truth
 from sim_twin.model.world import World
+from tests.support.errors import raises
 
 
 @pytest.fixture
@@ -38,7 +39,7 @@ def bus() -> Iterator[BusConfig]:
 def test_the_truth_crosses_the_link_unchanged(bus: BusConfig, world: World) -> None:
     server, here = GroundTruthServer(bus, world), read_ground_truth(world)
     with GroundTruthClient(bus) as client:
-        there = client.truth()
+        there = client.read()
     server.close()
     assert there.object == "bottle"
     assert there.lifted_m == here.lifted_m
@@ -46,18 +47,20 @@ def test_the_truth_crosses_the_link_unchanged(bus: BusConfig, world: World) -> N
     np.testing.assert_array_equal(there.qpos, here.qpos)
 
 
-def test_a_robot_that_is_no_twin_is_a_clear_error(bus: BusConfig, world: World) -> None:
+def test_without_a_twin_there_is_a_clear_error(bus: BusConfig, world: World) -> None:
     GroundTruthServer(bus, world).close()
-    with GroundTruthClient(bus) as client, pytest.raises(HalTimeoutError, match="only a simulated HAL knows the truth"):
-        client.truth()
+    with GroundTruthClient(bus) as client, raises(HalTimeoutError, "no_twin"):
+        client.read()
 
 
+@pytest.mark.integration
 def test_a_program_that_forgets_to_close_its_server_still_ends(bus: BusConfig) -> None:
     program = (
         "from hal.bus.session import BusConfig; from sim_twin.model.scene import SceneConfig; "
-        "from sim_twin.ground_truth import TruthClient, TruthServer; from sim_twin.model.world import World; "
-        f"bus = BusConfig(port={bus.port}); server = TruthServer(bus, World(SceneConfig())); "
-        "client = TruthClient(bus); print(client.truth().object)"
+        "from sim_twin.ground_truth import GroundTruthClient, GroundTruthServer; from sim_twin.model.world "
+        "import World; "
+        f"bus = BusConfig(port={bus.port}); server = GroundTruthServer(bus, World(SceneConfig())); "
+        "client = GroundTruthClient(bus); print(client.read().object)"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=True)
     assert done.stdout.strip() == "bottle"

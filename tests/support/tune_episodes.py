@@ -33,7 +33,7 @@ def episode(scenario: Scenario, method: str, success: bool, *, candidate: int = 
     grasp = measured | {"down": rng.normal(0.3 if success else 0.7, 0.1)}
     first = grasp if rank == 0 else measured | {"down": rng.normal(0.9, 0.1)}
     row = {
-        **scenario.features(), "method": method, "version": "0", "success": success, "attempts": 1,
+        **scenario.columns(), "method": method, "version": "0", "success": success, "attempts": 1,
         "success_top1": success and rank == 0, "success_after": [success], "mode": "success" if success else "missed",
         "rank": rank, "candidate": candidate, "first_candidate": candidate if rank == 0 else 1000 + candidate,
         "alignment": grasp["alignment"], "generator_score": grasp["generator"],

@@ -1,4 +1,4 @@
-"""Runs scenarios on a Ray cluster that is there already; the rows are those of a local run."""
+"""Scenarios on an existing Ray cluster; the rows equal those of a local run."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 
 from hal.base.errors import Z1Error
 from sim_twin.benchmark.episodes.rows import Row
-from sim_twin.benchmark.episodes.runner import ONE_THREAD, Task, one_thread, run_task
+from sim_twin.benchmark.episodes.runner import SINGLE_THREAD_ENV, Task, limit_threads, run_task
 
 _ROOMS = ("hal", "models", "calibration", "z1_runtime", "sim_twin")
 _ROOT = Path(__file__).parents[3]
@@ -25,7 +25,7 @@ class NoRayError(Z1Error, RuntimeError):
 
 
 class ClusterError(Z1Error, RuntimeError):
-    """The cluster cannot be reached or has no core for us."""
+    """The cluster cannot be reached or has no free core."""
 
     default_code = "cluster"
 
@@ -37,31 +37,35 @@ def run_tasks_on_ray(tasks: Sequence[Task], address: str) -> Iterator[list[Row]]
     own code travels with the run.
 
     Args:
-        tasks: without recordings, which would lie on the cluster's machines.
+        tasks: without recordings, which would stay on the cluster's machines.
         address: of the cluster: `auto`, `HOST:6379` from one of its machines, `ray://HOST:10001` from elsewhere.
 
     Raises:
         NoRayError: the extra `ray` is not installed.
-        ClusterError: nobody answers at `address`.
+        ClusterError: no cluster answers at `address`.
     """
-    ray = _ray()
+    ray = _import_ray()
     try:
-        ray.init(address=address, runtime_env=_environment(), log_to_driver=False, logging_level="ERROR")
+        ray.init(address=address, runtime_env=_worker_environment(), log_to_driver=False, logging_level="ERROR")
     except (ConnectionError, ValueError, RuntimeError, TimeoutError) as error:
         raise ClusterError(
-            f"no Ray cluster answers at {address!r} ({error}); start one with `ray start --head`, and give its "
-            "HOST:6379, or ray://HOST:10001 from a machine that is no part of it."
+            f"cluster: no Ray cluster answers at {address!r} ({error}). Start one with `ray start --head`, and give "
+            "its HOST:6379, or ray://HOST:10001 from a machine that is no part of it.",
+            code="cluster_unreachable",
         ) from error
     try:
         cores = int(ray.cluster_resources().get("CPU", 0))
         if not cores:
-            raise ClusterError(f"the Ray cluster at {address!r} has no CPU; it has {ray.cluster_resources()}.")
-        yield from _in_order_of_ending(ray, tasks, _AHEAD * cores)
+            raise ClusterError(
+                f"cluster: {address!r} has no CPU ({ray.cluster_resources()}, allowed 1 or more). Add a machine to it.",
+                code="cluster_no_cpu",
+            )
+        yield from _iterate_completed(ray, tasks, _AHEAD * cores)
     finally:
         ray.shutdown()
 
 
-def _in_order_of_ending(ray: Any, tasks: Sequence[Task], ahead: int) -> Iterator[list[Row]]:
+def _iterate_completed(ray: Any, tasks: Sequence[Task], ahead: int) -> Iterator[list[Row]]:
     remote = ray.remote(num_cpus=1)(_run_on_worker)
     waiting = iter(tasks)
     running = [remote.remote(task) for task in islice(waiting, ahead)]
@@ -72,23 +76,24 @@ def _in_order_of_ending(ray: Any, tasks: Sequence[Task], ahead: int) -> Iterator
 
 
 def _run_on_worker(task: Task) -> list[Row]:
-    one_thread()
+    limit_threads()
     return run_task(task)
 
 
-def _environment() -> dict[str, Any]:
+def _worker_environment() -> dict[str, Any]:
     return {
         "py_modules": [str(_ROOT / room) for room in _ROOMS],
         "excludes": ["**/__pycache__"],
-        "env_vars": dict(ONE_THREAD),
+        "env_vars": dict(SINGLE_THREAD_ENV),
     }
 
 
-def _ray() -> ModuleType:
+def _import_ray() -> ModuleType:
     try:
         import ray  # pyright: ignore[reportMissingImports] (an extra)
     except ImportError as error:
         raise NoRayError(
-            "--ray needs the package ray, which is an extra: uv sync --inexact --extra ray, then run this again."
+            "cluster: the package ray is not installed (extra `ray`). Run uv sync --inexact --extra ray, and "
+            "this again."
         ) from error
     return ray

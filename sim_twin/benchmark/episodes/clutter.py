@@ -1,4 +1,4 @@
-"""Where neighbours stand: beside and behind the object, with room for the hand between."""
+"""Sampled places of neighbours: left and right of the object and behind it, with room for the gripper between."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ import numpy as np
 from sim_twin.model.objects import OBJECTS
 from sim_twin.model.scene import Neighbour, SceneConfig
 
-MOST = 3
-"""Neighbours that an object may have."""
+MAX_NEIGHBOURS = 3
+"""Maximum number of neighbours of an object."""
 GAP_M = (0.070, 0.130)
-"""Free table between the object's outermost point and a neighbour's: a hand has room, and may still hit it."""
+"""Free table between the object's outermost point and a neighbour's [m]: the gripper fits, and may still collide."""
 _BETWEEN_M = 0.020
 _BEARING_DEG = 115.0
-"""From straight behind the object to either side; before it a neighbour would stand in the camera's view."""
+"""From straight behind the object to either side; in front of it a neighbour would occlude it."""
 _X_M, _Y_M = (0.36, 0.85), (-0.45, 0.45)
 _TRIES = 2000
 
 
 def draw_neighbours(scene: SceneConfig, count: int, names: Sequence[str], seed: int) -> tuple[Neighbour, ...]:
-    """Return `count` neighbours of the object of `scene`, each another of `names` as far as these go.
+    """Return `count` neighbours of the object of `scene`, all different while `names` suffice.
 
     Args:
         scene: with the object in its place.
@@ -30,18 +30,18 @@ def draw_neighbours(scene: SceneConfig, count: int, names: Sequence[str], seed: 
         seed: the same one gives the same neighbours.
 
     Raises:
-        RuntimeError: no room was found.
+        RuntimeError: no place was found.
     """
     rng = np.random.default_rng([seed, 0xC1])
     order = [names[int(k) % len(names)] for k in rng.permutation(max(count, len(names)))]
     pose = scene.T_base_object()
-    middle, radius_m = pose[:2, 3], _radius_m(scene.thing.corners() @ pose[:3, :3].T)
-    standing: list[tuple[np.ndarray, float]] = []
+    middle, radius_m = pose[:2, 3], _radius_m(scene.grasp_object.corners() @ pose[:3, :3].T)
+    placed: list[tuple[np.ndarray, float]] = []
     neighbours = []
     for name in order[:count]:
         own_m = _radius_m(OBJECTS[name].corners())
-        where = _place(rng, middle, radius_m + own_m, own_m, standing)
-        standing.append((where, own_m))
+        where = _place(rng, middle, radius_m + own_m, own_m, placed)
+        placed.append((where, own_m))
         x_m, y_m = (float(value) for value in where)
         neighbours.append(Neighbour(object=name, x_m=x_m, y_m=y_m, yaw_deg=float(rng.uniform(-180.0, 180.0))))
     return tuple(neighbours)
@@ -52,19 +52,21 @@ def _place(
     middle: np.ndarray,
     touching_m: float,
     own_m: float,
-    standing: Sequence[tuple[np.ndarray, float]],
+    placed: Sequence[tuple[np.ndarray, float]],
 ) -> np.ndarray:
-    """Return where (2,) on the table the next one stands: `touching_m` and a gap from the object, clear of others."""
+    """Return the place (2,) of the next neighbour: `touching_m` and a gap from the object, clear of the others."""
     behind = np.arctan2(middle[1], middle[0])
     for _ in range(_TRIES):
         bearing = behind + np.deg2rad(rng.uniform(-_BEARING_DEG, _BEARING_DEG))
         where = middle + (touching_m + rng.uniform(*GAP_M)) * np.array([np.cos(bearing), np.sin(bearing)])
         on_table = _X_M[0] <= where[0] <= _X_M[1] and _Y_M[0] <= where[1] <= _Y_M[1]
-        if on_table and all(np.linalg.norm(where - p) > own_m + r + _BETWEEN_M for p, r in standing):
+        if on_table and all(np.linalg.norm(where - p) > own_m + r + _BETWEEN_M for p, r in placed):
             return where
-    raise RuntimeError(f"no room for another neighbour was found in {_TRIES} tries; {len(standing)} stand already.")
+    raise RuntimeError(
+        f"clutter: no place for another neighbour ({len(placed)} placed, {_TRIES} tries). Ask for fewer neighbours."
+    )
 
 
 def _radius_m(corners: np.ndarray) -> float:
-    """Return how far `corners` (N, 3) reach from the origin across the table [m]."""
+    """Return the radius of `corners` (N, 3) about the origin in the table's plane [m]."""
     return float(np.hypot(corners[:, 0], corners[:, 1]).max())

@@ -1,4 +1,4 @@
-"""One scenario, seen once, decided and executed by each method in turn: a row a method."""
+"""One scenario, observed once, planned and executed by each method in turn: one row per method."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ import numpy as np
 from hal.base.errors import HalError
 from hal.base.messages import RgbdFrame
 from models.obb.obb import DegenerateCloudError
+from sim_twin.benchmark.episodes.execution import RETRIED, EpisodeRobot, Mode, Outcome, capture
 from sim_twin.benchmark.episodes.methods import Method, file_name
 from sim_twin.benchmark.episodes.occlusion import occlude
 from sim_twin.benchmark.episodes.recordings import Recordings, record
-from sim_twin.benchmark.episodes.rows import Attempt, Row, make_row
+from sim_twin.benchmark.episodes.rows import Attempt, Row, make_error_row, make_row
 from sim_twin.benchmark.episodes.scenarios import Scenario
-from sim_twin.benchmark.episodes.seen import SharedObservation
-from sim_twin.benchmark.episodes.trial import RETRIED, Mode, Outcome, Robot, look
+from sim_twin.benchmark.episodes.shared_observation import SharedObservation
 from z1_runtime.grasping.features import measure_features
 from z1_runtime.motion.executor import MotionError
 from z1_runtime.perception.errors import PerceptionError
@@ -27,7 +27,7 @@ from z1_runtime.tasks.grasp_selection import GraspSelector, StageTimes
 from z1_runtime.types import Rejection, RejectionReason
 
 MakeDecider = Callable[[Scenario, int], GraspSelector]
-"""Returns the runtime's decider for a scenario, with the generator's seed set to the second argument."""
+"""Return the runtime's grasp selector for a scenario, with the generator's seed set to the second argument."""
 
 
 def run_scenario(
@@ -41,33 +41,42 @@ def run_scenario(
     """Return one row for each of `methods`, all on the same first frame and the same candidates.
 
     Args:
-        scenario: what stands where.
-        methods: how candidates are ordered.
+        scenario: what is_stable where.
+        methods: orders of the candidates.
         make_grasp_selector: called once for each attempt.
-        top_k: candidates that may be executed; after a failure the scene is looked at again, as it then is.
-        recordings: which episodes are written for Rerun too.
+        top_k: candidates that may be executed; after a failure the scene as it then is is captured again.
+        recordings: the episodes to record for Rerun too.
     """
-    decider = make_grasp_selector(scenario, scenario.draw_seed)
-    seen = _first_look(scenario, decider)
-    if isinstance(seen, Attempt):
-        return [make_row(scenario, method.name, [seen], top_k=top_k) for method in methods]
-    return [
-        _run_method(scenario, method, make_grasp_selector, seen, top_k=top_k, recordings=recordings)
-        for method in methods
-    ]
+    decider = make_grasp_selector(scenario, scenario.draw_seed)  # settings that cannot be used end the run here
+    try:
+        shared = _observe_first(scenario, decider)
+    except Exception as error:  # one scenario's defect must not cost the run the others
+        return [make_error_row(scenario, method.name, error, top_k=top_k) for method in methods]
+    rows = []
+    for method in methods:
+        try:
+            row = (
+                make_row(scenario, method.name, [shared], top_k=top_k)
+                if isinstance(shared, Attempt)
+                else _run_method(scenario, method, make_grasp_selector, shared, top_k=top_k, recordings=recordings)
+            )
+        except Exception as error:  # as above: the row keeps type, text and traceback
+            row = make_error_row(scenario, method.name, error, top_k=top_k)
+        rows.append(row)
+    return rows
 
 
 def record_scenario(scenario: Scenario, method: Method, make_grasp_selector: MakeDecider, folder: Path) -> Path | None:
-    """Write what `method` sees, ranks and chooses at its first look as <scenario>-<method>.rrd in `folder`.
+    """Write observation, ranking and plan of the first attempt of `method` as <scenario>-<method>.rrd in `folder`.
 
     Returns:
-        The file, or None where nothing is seen.
+        The file, or None where nothing is detected.
     """
     decider = make_grasp_selector(scenario, scenario.draw_seed)
-    seen = _first_look(scenario, decider)
-    if isinstance(seen, Attempt):
+    shared = _observe_first(scenario, decider)
+    if isinstance(shared, Attempt):
         return None
-    return record(folder / recording_name(scenario, method), _decide(method, decider, seen))
+    return record(folder / recording_name(scenario, method), _decide(method, decider, shared))
 
 
 def recording_name(scenario: Scenario, method: Method) -> str:
@@ -75,13 +84,15 @@ def recording_name(scenario: Scenario, method: Method) -> str:
     return f"{scenario.key}-{file_name(method.name)}.rrd"
 
 
-def _first_look(scenario: Scenario, decider: GraspSelector) -> SharedObservation | Attempt:
-    """Return what is seen from home, or the attempt that ended with the look."""
-    frame, q = look(scenario.scene())
-    return _see(scenario, decider, frame, q)
+def _observe_first(scenario: Scenario, decider: GraspSelector) -> SharedObservation | Attempt:
+    """Return the observation from home, or the attempt that ended with it."""
+    frame, q = capture(scenario.scene())
+    return _observe(scenario, decider, frame, q)
 
 
-def _see(scenario: Scenario, decider: GraspSelector, frame: RgbdFrame, q: np.ndarray) -> SharedObservation | Attempt:
+def _observe(
+    scenario: Scenario, decider: GraspSelector, frame: RgbdFrame, q: np.ndarray
+) -> SharedObservation | Attempt:
     times = StageTimes()
     try:
         return SharedObservation.by(decider, occlude(frame, scenario.occlusion, scenario.draw_seed), q, times)
@@ -97,17 +108,17 @@ def _run_method(
     scenario: Scenario,
     method: Method,
     make_grasp_selector: MakeDecider,
-    seen: SharedObservation,
+    shared: SharedObservation,
     *,
     top_k: int,
     recordings: Recordings | None,
 ) -> Row:
     decider = make_grasp_selector(scenario, scenario.draw_seed)
-    first = _decide(method, decider, seen)
+    first = _decide(method, decider, shared)
     attempts, given_up, qpos = [first], "", None
     if first.plan is not None:
-        with Robot(scenario.scene(), decider.kinematics, decider.config.speed) as robot:
-            attempts, given_up = _act(scenario, method, make_grasp_selector, robot, first, top_k=top_k)
+        with EpisodeRobot(scenario.scene(), decider.kinematics, decider.config.speed) as robot:
+            attempts, given_up = _execute_attempts(scenario, method, make_grasp_selector, robot, first, top_k=top_k)
             qpos = robot.world.data.qpos.copy()
     row = make_row(scenario, method.name, attempts, top_k=top_k, given_up=given_up, qpos=qpos)
     if recordings is not None and recordings.wants(success=row["success"]):
@@ -115,16 +126,21 @@ def _run_method(
     return row
 
 
-def _act(
-    scenario: Scenario, method: Method, make_grasp_selector: MakeDecider, robot: Robot, first: Attempt, *, top_k: int
+def _execute_attempts(
+    scenario: Scenario,
+    method: Method,
+    make_grasp_selector: MakeDecider,
+    robot: EpisodeRobot,
+    first: Attempt,
+    *,
+    top_k: int,
 ) -> tuple[list[Attempt], str]:
-    """Execute `first` and, after a failure, what is decided on another look; return all attempts and why it was left
-    at them."""
+    """Execute `first` and, after a failure, new plans; return all attempts and why there are no more."""
     attempt = first
     attempts: list[Attempt] = []
     while True:
         assert attempt.plan is not None
-        outcome = robot.act(attempt.plan)
+        outcome = robot.execute(attempt.plan)
         attempts.append(replace(attempt, outcome=outcome))
         if outcome.mode not in RETRIED or len(attempts) == top_k:
             return attempts, ""
@@ -132,8 +148,8 @@ def _act(
         try:
             robot.withdraw(attempt.plan, outcome, decider.config.jaw_home)
             if len(attempts) == 1:
-                robot.look()  # this robot's first frame would have the noise of the episode's first look
-            found = _see(scenario, decider, *robot.look())
+                robot.capture()  # this robot's first frame would have the noise of the episode's first frame
+            found = _observe(scenario, decider, *robot.capture())
         except (MotionError, HalError) as error:
             return attempts, f"{Mode.STOPPED.value}: {error}"
         attempt = found if isinstance(found, Attempt) else _decide(method, decider, found)
@@ -141,22 +157,22 @@ def _act(
             return attempts, f"{attempt.ended.mode.value}: {attempt.ended.detail}"
 
 
-def _decide(method: Method, decider: GraspSelector, seen: SharedObservation) -> Attempt:
-    """Return the attempt that `method` would make; without a plan where there is none."""
+def _decide(method: Method, decider: GraspSelector, shared: SharedObservation) -> Attempt:
+    """Return the attempt of `method`; without a plan where there is none."""
     times = StageTimes()
-    times.ms |= seen.times.ms
+    times.ms |= shared.times.ms
     best_first = left = None
     try:
-        best_first, left = method.order(seen, decider, times)
-        plan = decider.planner.plan(best_first.candidates, seen.q, times.stage)
+        best_first, left = method.order(shared, decider, times)
+        plan = decider.planner.plan(best_first.candidates, shared.q, times.stage)
     except (DegenerateCloudError, NoPlanError) as error:
         rejections = error.rejections if isinstance(error, NoPlanError) else ()
         outcome = Outcome(mode=_why_no_plan(rejections), detail=str(error))
         ranked = best_first and best_first.ranked
-        attempt = Attempt(times=times, outcome=outcome, seen=seen, ranked=ranked, left=left, rejections=rejections)
+        attempt = Attempt(times=times, outcome=outcome, shared=shared, ranked=ranked, left=left, rejections=rejections)
     else:
         ranked = best_first.ranked
-        attempt = Attempt(times=times, seen=seen, ranked=ranked, left=left, plan=plan, rejections=plan.rejections)
+        attempt = Attempt(times=times, shared=shared, ranked=ranked, left=left, plan=plan, rejections=plan.rejections)
     return replace(attempt, features=_features(attempt, best_first))
 
 
@@ -172,7 +188,7 @@ def _features(attempt: Attempt, best_first: RankedCandidates | None) -> np.ndarr
 
 
 def _why_no_plan(rejections: Sequence[Rejection]) -> Mode:
-    """Return the stage at which the candidate that came furthest was refused."""
+    """Return the stage of the rejection of the candidate that came furthest."""
     reasons = {rejection.reason for rejection in rejections}
     if reasons & {RejectionReason.PATH, RejectionReason.SELF}:
         return Mode.NO_PATH

@@ -1,4 +1,4 @@
-"""The orders in which a method tries the very same candidates."""
+"""Methods: orders in which the same candidates are tried."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from hal.base.errors import InvalidValueError
 from models.obb.mvbb import FitMethod, RankedGrasps, fit_obb, rank_by_score, rank_grasps
-from sim_twin.benchmark.episodes.seen import SharedObservation
+from sim_twin.benchmark.episodes.shared_observation import SharedObservation
 from z1_runtime.grasping.features import fit_upright_box, measure_features
 from z1_runtime.grasping.grasp_candidates import EARLY_EXIT_CHUNK
 from z1_runtime.grasping.ranking import Ranking, ScoringHead, load_scoring
@@ -20,31 +20,31 @@ from z1_runtime.tasks.grasp_selection import GraspSelector, StageTimes
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Method:
-    """How candidates are filtered and ranked; what is None is as the configuration has it."""
+    """Filter and ranking of the candidates; None keeps the configuration's value."""
 
     name: str
-    """As the reports call it."""
+    """Name in reports and rows."""
     rank_by: Literal["score", "box", "full"]
-    """The generator's score; the paper's MVBB; or all that the runtime knows."""
+    """The generator's score; the paper's MVBB; or the runtime's own ranking."""
     collision_filter: bool = True
-    """Whether grasps that hit the point cloud are dropped before the ranking; `full` looks for itself."""
+    """Whether grasps that hit the point cloud are dropped before the ranking; `full` has its own check."""
     box: FitMethod | None = None
-    """How the box is fitted."""
+    """Fit of the box."""
     k: int | None = None
-    """Faces that may be approached."""
+    """Number of faces that may be approached."""
     alpha: float | None = None
     """Weight of the alignment."""
     hard_filter: bool | None = None
     """Whether grasps with a_j ≤ 0 are dropped; without it they only rank low."""
     min_alignment: float | None = None
-    """Grasps less aligned come last."""
+    """Alignment below which grasps come last."""
     min_score: float | None = None
-    """So do those to which the generator gave less."""
+    """Generator score below which grasps come last."""
     head: ScoringHead | None = None
-    """What orders the grasps instead of α, or instead of the runtime's weights."""
+    """Scoring head that orders the grasps instead of α, or of the runtime's weights."""
 
     def ranking(self, configured: Ranking) -> Ranking:
-        """Return the numbers it ranks by; those it does not say itself are `configured`."""
+        """Return the numbers of its ranking; those that it does not set are `configured`."""
         own = {
             "box_method": self.box,
             "k_faces": self.k,
@@ -57,14 +57,14 @@ class Method:
         return replace(configured, **{name: value for name, value in own.items() if value is not None})
 
     def order(
-        self, seen: SharedObservation, decider: GraspSelector, times: StageTimes
+        self, shared: SharedObservation, decider: GraspSelector, times: StageTimes
     ) -> tuple[RankedCandidates, np.ndarray]:
         """Return the candidates in the order to try them, and which (M,) were left before the ranking.
 
-        The ranking's own indices count in those that were left.
+        The ranking's own indices count in these.
 
         Args:
-            seen: the observation, with its candidates.
+            shared: the observation, with its candidates.
             decider: whose kinematics, gripper and box settings are used.
             times: gets the stages `collision` (the scene), `filter` (of collisions) and `rank` (fit, filter by the
                 box, score).
@@ -73,16 +73,16 @@ class Method:
             DegenerateCloudError: the object's cloud spans no box.
             NoPlanError: `full` keeps none.
         """
-        scene = seen.scene(decider, times)
+        scene = shared.scene(decider, times)
         if self.rank_by == "full":
             ranking = self.ranking(decider.ranking)
             with times.stage("rank"):
-                filtered = decider.filter(seen.candidates, seen.observation, ranking)
-                return decider.rank(filtered, scene, ranking), np.arange(len(seen.candidates))
-        fitted = seen.fitted(decider, times) if self.collision_filter else None
-        left = np.arange(len(seen.candidates)) if fitted is None else np.flatnonzero(fitted.free())
+                filtered = decider.filter(shared.candidates, shared.observation, ranking)
+                return decider.rank(filtered, scene, ranking), np.arange(len(shared.candidates))
+        fitted = shared.fitted(decider, times) if self.collision_filter else None
+        left = np.arange(len(shared.candidates)) if fitted is None else np.flatnonzero(fitted.free())
         with times.stage("rank"):
-            ranked, ranking = self._rank_left(seen, left)
+            ranked, ranking = self._rank_left(shared, left)
             if fitted is not None:
                 candidates = fitted.reordered(left[ranked.indices])
             else:
@@ -91,12 +91,12 @@ class Method:
                 return RankedCandidates(ranked=ranked, candidates=candidates), left
             return _order_by(ranking, RankedCandidates(ranked=ranked, candidates=candidates)), left
 
-    def _rank_left(self, seen: SharedObservation, left: np.ndarray) -> tuple[RankedGrasps, Ranking | None]:
+    def _rank_left(self, shared: SharedObservation, left: np.ndarray) -> tuple[RankedGrasps, Ranking | None]:
         """Return the candidates `left` (M,) by score, or by the paper's box and then with the ranking of that box."""
-        grasps = seen.candidates[left]
+        grasps = shared.candidates[left]
         if self.rank_by == "score":
             return rank_by_score(grasps), None
-        ranking, observation = self.ranking(Ranking()), seen.observation
+        ranking, observation = self.ranking(Ranking()), shared.observation
         box = fit_obb(observation.object_points, ranking.box_method, up=observation.T_base_camera[2, :3])
         return rank_grasps(
             grasps, box, k=ranking.k_faces, alpha=ranking.alpha, hard_filter=ranking.hard_filter
@@ -120,7 +120,7 @@ def _order_by(ranking: Ranking, by_box: RankedCandidates) -> RankedCandidates:
 
 
 _BEHIND = 2.0
-"""More than two scores can differ by."""
+"""Greater than any difference of two scores."""
 METHODS = {
     "vanilla": Method(name="vanilla", rank_by="score"),
     "mvb": Method(name="mvb", rank_by="box", box="pca", k=2, alpha=0.85, hard_filter=True),
@@ -130,7 +130,7 @@ METHODS = {
 _NUMBERS = {"k": int, "alpha": float, "min_alignment": float, "min_score": float}
 _OF_BOX = (*_NUMBERS, "box", "hard_filter", "scoring")
 _SETTINGS = {"vanilla": ("collision_filter",), "mvb": (*_OF_BOX, "collision_filter"), "full": _OF_BOX}
-"""What can be changed, by method."""
+"""Settings that can be changed, by method."""
 
 
 def file_name(method: str) -> str:
@@ -149,42 +149,55 @@ def parse_method(text: str) -> Method:
     """
     name, _, settings = text.partition(":")
     if name not in METHODS:
-        raise InvalidValueError(f"there is no method {name!r}; known: {', '.join(METHODS)}.")
+        raise InvalidValueError(
+            f"method: the name is unknown ({name!r}, allowed {', '.join(METHODS)}). Choose one of these.",
+            code="unknown_method",
+        )
     changes: dict[str, object] = {}
     for setting in filter(None, settings.split(",")):
         key, _, value = setting.partition("=")
         if key not in _SETTINGS[name]:
             raise InvalidValueError(
-                f"method {text!r} has an unknown setting {key!r}; known: {', '.join(_SETTINGS[name])}."
+                f"method {text!r}: a setting is unknown ({key!r}, allowed {', '.join(_SETTINGS[name])}). Use these.",
+                code="unknown_setting",
             )
         if key == "scoring":
-            changes = {**_from_file(name, Path(value)), **changes}
+            changes = {**_load_settings(name, Path(value)), **changes}
         else:
-            changes[key] = _converted(text, key, value)
+            changes[key] = _parse_value(text, key, value)
     method = replace(METHODS[name], name=text, **changes)  # pyright: ignore[reportArgumentType]
     try:
         method.ranking(Ranking())
     except ValueError as error:
-        raise InvalidValueError(f"method {text!r}: {error}") from error
+        raise InvalidValueError(f"method {text!r}: {error}", code="method_value") from error
     return method
 
 
-def _from_file(name: str, path: Path) -> dict[str, object]:
+def _load_settings(name: str, path: Path) -> dict[str, object]:
     ranking = getattr(load_scoring(path), name)
     values = {each.name: getattr(ranking, each.name) for each in fields(Ranking)}
     return {"box": values.pop("box_method"), "k": values.pop("k_faces"), **values}
 
 
-def _converted(text: str, key: str, value: str) -> object:
+def _parse_value(text: str, key: str, value: str) -> object:
     if key in ("hard_filter", "collision_filter"):
         if value not in ("yes", "no"):
-            raise InvalidValueError(f"method {text!r}: {key} is {value!r}; say yes or no.")
+            raise InvalidValueError(
+                f"method {text!r}: {key} is invalid ({value!r}, allowed yes or no). Give one of these.",
+                code="method_value",
+            )
         return value == "yes"
     if key == "box":
         if value not in get_args(FitMethod):
-            raise InvalidValueError(f"method {text!r}: box is {value!r}; allowed: {', '.join(get_args(FitMethod))}.")
+            raise InvalidValueError(
+                f"method {text!r}: box is unknown ({value!r}, allowed {', '.join(get_args(FitMethod))}). "
+                "Give one of these.",
+                code="method_value",
+            )
         return value
     try:
         return _NUMBERS[key](value)
     except ValueError as error:
-        raise InvalidValueError(f"method {text!r}: {key} is {value!r}, which is no number.") from error
+        raise InvalidValueError(
+            f"method {text!r}: {key} is invalid ({value!r}, allowed numbers). Give a number.", code="method_value"
+        ) from error

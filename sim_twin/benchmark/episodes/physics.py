@@ -1,4 +1,4 @@
-"""What a world may have otherwise than the runtime believes: drawn once an episode."""
+"""Deviations of a world from the runtime's model, sampled once per episode."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 SPREAD = 0.3
-"""Friction and mass are off by up to this share."""
+"""Maximum relative deviation of friction and mass."""
 MOUNT_ERROR_M, MOUNT_ERROR_DEG = 0.003, 1.0
-"""The camera sits and looks beside where the runtime has it by this much, in any direction."""
+"""Offset and turn of the camera from the runtime's extrinsics, in any direction."""
 MAX_ARM_LATENCY_S = 0.020
-"""The arm does what it is told up to this much late: its controller's cycle, the network and the motors' own loops."""
+"""Maximum latency of the arm: its controller's cycle, the network and the motors' own loops."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -26,7 +26,7 @@ class Physics:
     arm_latency_s: float = 0.0
 
     @classmethod
-    def drawn(cls, seed: int) -> Physics:
+    def sample(cls, seed: int) -> Physics:
         """Return the deviations that belong to `seed`."""
         rng = np.random.default_rng([seed, 0xF0])  # a stream of its own: the camera's noise has the bare seed
         friction, mass = rng.uniform(1.0 - SPREAD, 1.0 + SPREAD, 2)

@@ -1,4 +1,4 @@
-"""Rerun recordings of what a method saw, ranked and chose in an episode."""
+"""Rerun recordings of observation, ranking and plan of an episode."""
 
 from __future__ import annotations
 
@@ -15,25 +15,28 @@ _CLOSE_S = 60.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Recordings:
-    """Which episodes are recorded as they are run, and where to."""
+    """Choice of the episodes to record, and their folder."""
 
     folder: Path
     choice: Literal["failures", "all"]
 
     def wants(self, *, success: bool) -> bool:
-        """Return whether an episode that ended so is recorded."""
+        """Return whether an episode with this outcome is recorded."""
         return self.choice == "all" or not success
 
 
 def record(path: Path, attempt: Attempt) -> Path:
-    """Write the clouds, the candidates, the box and the plan of `attempt`, as far as it came to them, to `path`.
+    """Write the clouds, the candidates, the box and the plan of `attempt`, as far as there are any, to `path`.
 
     Raises:
-        ValueError: nothing was seen.
+        InvalidValueError: nothing was observed.
     """
-    if attempt.seen is None:
-        raise InvalidValueError(f"an attempt in which nothing was seen cannot be recorded as {path}.")
-    observation, ranked = attempt.seen.observation, attempt.ranked
+    if attempt.shared is None:
+        raise InvalidValueError(
+            f"recording: the attempt has no observation to write to {path}. Record attempts with a detection.",
+            code="no_observation",
+        )
+    observation, ranked = attempt.shared.observation, attempt.ranked
     inspector = RerunLogger(path)
     inspector.log_observation(observation)
     if ranked is not None:

@@ -1,7 +1,8 @@
-"""One episode as a line of a table: what it was, what was seen and chosen, and how it ended."""
+"""One episode as a row of a table: scenario, observation, plan and outcome."""
 
 from __future__ import annotations
 
+import traceback
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -12,29 +13,32 @@ from typing import Any
 import numpy as np
 
 from models.obb.mvbb import RankedGrasps
+from sim_twin.benchmark.episodes.execution import Mode, Outcome
 from sim_twin.benchmark.episodes.scenarios import Scenario
-from sim_twin.benchmark.episodes.seen import SharedObservation
-from sim_twin.benchmark.episodes.targeting import overlap
-from sim_twin.benchmark.episodes.trial import Mode, Outcome
+from sim_twin.benchmark.episodes.shared_observation import SharedObservation
+from sim_twin.benchmark.episodes.targeting import compute_iou
 from z1_runtime.grasping.features import FEATURES
 from z1_runtime.tasks.grasp_selection import StageTimes
 from z1_runtime.types import GraspPlan, Rejection, RejectionReason
 
 Row = dict[str, Any]
-"""One episode: column to value, as `make_row` says. A column that does not apply is missing, in the table None."""
+"""One episode: column to value, see `make_row`. A column that does not apply is missing, in the table None."""
+
+TRACEBACK = "traceback"
+"""Key of an error row's traceback."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Attempt:
-    """One look and what came of it, as far as it came."""
+    """One observation and its results, as far as the attempt came."""
 
     times: StageTimes
     outcome: Outcome | None = None
-    """None while it has a plan that was not executed."""
-    seen: SharedObservation | None = None
+    """None before its plan is executed."""
+    shared: SharedObservation | None = None
     ranked: RankedGrasps | None = None
     left: np.ndarray | None = None
-    """(M,) candidates left before the ranking, whose indices count in these."""
+    """(M,) candidates before the ranking, whose indices count in these."""
     plan: GraspPlan | None = None
     rejections: Sequence[Rejection] = ()
     features: np.ndarray | None = None
@@ -43,7 +47,7 @@ class Attempt:
 
     @property
     def ended(self) -> Outcome:
-        """How it ended; only once it has."""
+        """The outcome, once there is one."""
         assert self.outcome is not None, "this attempt was not executed"
         return self.outcome
 
@@ -59,20 +63,20 @@ def make_row(
 ) -> Row:
     """Return the row of one method's episode.
 
-    What a look, a decision and its outcome are told by is that of the last attempt; `success_top1` is of the first.
+    Observation, decision and outcome are those of the last attempt; `success_top1` is of the first.
 
     Args:
-        scenario: `object`, `distance`, …, and the physics and neighbours that were drawn for it.
+        scenario: `object`, `distance`, …, and the physics and neighbours that were sample for it.
         method: its name.
-        attempts: one or more; `attempts`, `modes` and `ranks` tell of each, `success_after` (top_k,) whether the object
-            was lifted within one, two, … of them.
+        attempts: one or more; `attempts`, `modes` and `ranks` describe each, `success_after` (top_k,) whether the
+            object was lifted within one, two, … of them.
         top_k: how many there might have been.
         given_up: why there were no more, if that was not for success or their number.
         qpos: MuJoCo's positions at the end; None where nothing moved.
     """
     first, last = attempts[0], attempts[-1]
     success = last.ended.mode is Mode.SUCCESS
-    row: Row = {**scenario.features(), "method": method, "version": _version()}
+    row: Row = {**scenario.columns(), "method": method, "version": _version()}
     row |= {"success": success, "success_top1": _is_top1(first)}
     row |= {
         "top_k": top_k,
@@ -86,8 +90,22 @@ def make_row(
     row |= {f"{stage}_ms": ms for stage, ms in last.times.ms.items()}
     reasons = Counter(rejection.reason for rejection in last.rejections)
     row |= {f"rejected_{reason}": reasons[reason] for reason in RejectionReason}
-    row |= _of_look(last.seen) | _of_ranking(last) | _of_plan(last) | _of_features(last)
+    row |= _observation_columns(last.shared) | _ranking_columns(last) | _plan_columns(last) | _feature_columns(last)
     return row if qpos is None else row | {"final_qpos": qpos.tolist()}
+
+
+def make_error_row(scenario: Scenario, method: str, error: Exception, *, top_k: int = 1) -> Row:
+    """Return the row of an episode that `error` ended: a failure of this episode alone.
+
+    `error_type` and `detail` hold the exception's type and text; `TRACEBACK` is for the run's log (see
+    `sim_twin.benchmark.results.store.Store.add`) and no column of the table.
+    """
+    mode = Mode.ERROR.value
+    row: Row = {**scenario.identity(), "method": method, "version": _version()}
+    row |= {"success": False, "success_top1": False, "top_k": top_k, "attempts": 1, "modes": [mode], "ranks": [-1]}
+    row |= {"success_after": [False] * top_k, "given_up": "", "mode": mode}
+    row |= {"detail": str(error), "error_type": type(error).__name__}
+    return row | {TRACEBACK: "".join(traceback.format_exception(error))}
 
 
 def _is_top1(attempt: Attempt) -> bool:
@@ -99,32 +117,32 @@ def _version() -> str:
     return version("z1-grasp")
 
 
-def _of_look(seen: SharedObservation | None) -> Row:
-    if seen is None:
+def _observation_columns(shared: SharedObservation | None) -> Row:
+    if shared is None:
         return {}
-    detection, truth = seen.observation.detection, seen.frame.ground_truth_mask
+    detection, ground_truth = shared.observation.detection, shared.frame.ground_truth_mask
     return {
-        "n_object_points": len(seen.observation.object_points),
-        "n_candidates": len(seen.candidates),
+        "n_object_points": len(shared.observation.object_points),
+        "n_candidates": len(shared.candidates),
         "detection_label": detection.label,
         "detection_confidence": detection.confidence,
-        "iou": float("nan") if truth is None else overlap(detection, truth),
+        "iou": float("nan") if ground_truth is None else compute_iou(detection, ground_truth),
     }
 
 
-def _of_ranking(attempt: Attempt) -> Row:
-    ranked, seen, left = attempt.ranked, attempt.seen, attempt.left
-    if ranked is None or seen is None or left is None:
+def _ranking_columns(attempt: Attempt) -> Row:
+    ranked, shared, left = attempt.ranked, attempt.shared, attempt.left
+    if ranked is None or shared is None or left is None:
         return {}
     row: Row = {"n_free": len(left), "n_ranked": len(ranked)}
     if ranked.box is not None:
-        normals = ranked.box.face_normals[ranked.faces] @ seen.observation.T_base_camera[:3, :3].T
+        normals = ranked.box.face_normals[ranked.faces] @ shared.observation.T_base_camera[:3, :3].T
         row |= {"box_extents_m": ranked.box.extents_m.tolist(), "faces": ranked.faces.tolist()}
         row |= {"face_normals": normals.ravel().tolist()}
     return row
 
 
-def _of_plan(attempt: Attempt) -> Row:
+def _plan_columns(attempt: Attempt) -> Row:
     plan, ranked, left = attempt.plan, attempt.ranked, attempt.left
     if plan is None or ranked is None or left is None:
         return {}
@@ -142,8 +160,8 @@ def _of_plan(attempt: Attempt) -> Row:
     }
 
 
-def _of_features(attempt: Attempt) -> Row:
-    """Return what a scoring head is fitted to: of the first-ranked grasp `first_…`, of the executed one `grasp_…`."""
+def _feature_columns(attempt: Attempt) -> Row:
+    """Return the features for a scoring head: `first_…` of the first-ranked grasp, `grasp_…` of the executed one."""
     ranked, left, features = attempt.ranked, attempt.left, attempt.features
     if ranked is None or left is None or features is None:
         return {}

@@ -1,4 +1,4 @@
-"""Runs scenarios side by side and hands over every row as it comes."""
+"""Scenarios in parallel worker processes; rows are yielded as they come."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from sim_twin.benchmark.episodes.methods import Method
 from sim_twin.benchmark.episodes.recordings import Recordings
 from sim_twin.benchmark.episodes.rows import Row
 from sim_twin.benchmark.episodes.scenarios import Scenario
-from sim_twin.benchmark.episodes.targeting import aim
+from sim_twin.benchmark.episodes.targeting import select_target
 from z1_runtime.config import RuntimeConfig
 
 if TYPE_CHECKING:
@@ -26,8 +26,10 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-ONE_THREAD = {name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")}
-"""Environment of a process that shall keep to one core: the workers themselves fill the machine."""
+SINGLE_THREAD_ENV = {
+    name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+}
+"""Environment of a process limited to one core: the workers themselves fill the machine."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -50,7 +52,7 @@ def make_tasks(
     top_k: int = 1,
     recordings: Recordings | None = None,
 ) -> list[Task]:
-    """Return what is left to do: methods of a scenario that are done are left out."""
+    """Return the missing tasks: methods of a scenario with a row in `done` are left out."""
     tasks = []
     for scenario in scenarios:
         left = tuple(method for method in methods if (scenario.key, method.name) not in done)
@@ -60,10 +62,10 @@ def make_tasks(
 
 
 def run_task(task: Task) -> list[Row]:
-    """Return the rows of one task; what it needs is built once in each process."""
+    """Return the rows of one task; generator and detector are built once per process."""
     logging.getLogger("z1_runtime.tasks.grasp_selection").setLevel(
         logging.ERROR
-    )  # a camera off its mount is what is tried here
+    )  # warnings of wrong extrinsics are expected here: the benchmark varies them
 
     def decider(scenario: Scenario, seed: int) -> GraspSelector:
         return make_grasp_selector(task.config, scenario, seed)
@@ -81,14 +83,17 @@ def run_tasks(tasks: Sequence[T], jobs: int, run: Callable[[T], list[Row]] = run
         jobs: how many processes.
         run: does one task; a function of a module, which the processes import.
     """
-    # A fresh interpreter for each: forked ones would share OpenGL and torch with this one.
+    # A fresh interpreter for each: forked ones would inherit the state of OpenGL and torch.
     context = multiprocessing.get_context("spawn")
     jobs = min(jobs, max(len(tasks), 1))
-    with environment(ONE_THREAD), ProcessPoolExecutor(jobs, mp_context=context, initializer=one_thread) as pool:
-        yield from _in_order_of_ending(pool, tasks, 2 * jobs, run)
+    with (
+        set_environment(SINGLE_THREAD_ENV),
+        ProcessPoolExecutor(jobs, mp_context=context, initializer=limit_threads) as pool,
+    ):
+        yield from _iterate_completed(pool, tasks, 2 * jobs, run)
 
 
-def _in_order_of_ending(
+def _iterate_completed(
     pool: Executor, tasks: Sequence[T], ahead: int, run: Callable[[T], list[Row]]
 ) -> Iterator[list[Row]]:
     waiting = iter(tasks)
@@ -101,8 +106,8 @@ def _in_order_of_ending(
 
 
 @contextmanager
-def environment(variables: Mapping[str, str]) -> Iterator[None]:
-    """Set environment variables while the body runs: a child reads them before it can be told anything."""
+def set_environment(variables: Mapping[str, str]) -> Iterator[None]:
+    """Set environment variables while the body runs: a child reads them before any of its code runs."""
     before = {name: os.environ.get(name) for name in variables}
     os.environ.update(variables)
     try:
@@ -115,20 +120,20 @@ def environment(variables: Mapping[str, str]) -> Iterator[None]:
                 os.environ[name] = value
 
 
-def one_thread() -> None:
-    """Keep what heeds no variable to one thread too."""
+def limit_threads() -> None:
+    """Limit OpenCV, which ignores the variables, to one thread."""
     import cv2
 
     cv2.setNumThreads(1)
 
 
 def make_grasp_selector(config: RuntimeConfig, scenario: Scenario, seed: int) -> GraspSelector:
-    """Return the runtime's decider under `config`, told which object `scenario` means, with the generator's `seed`."""
+    """Return the runtime's grasp selector under `config` for the object of `scenario`, with the generator's `seed`."""
     from z1_runtime.perception.segmentation import Perception
     from z1_runtime.tasks.grasp_selection import GraspSelector
 
     base = _assembled(replace(config, seed=0))
-    config, detector = aim(replace(config, seed=seed), base.perception.detector, scenario)
+    config, detector = select_target(replace(config, seed=seed), base.perception.detector, scenario)
     perception = base.perception
     if detector is not perception.detector:
         perception = Perception(config.perception, detector, base.T_flange_camera)

@@ -1,4 +1,4 @@
-"""What stands where in each episode: the paper's 81 poses, and whatever a user adds."""
+"""Scenarios of the episodes: the paper's 81 poses, and further objects and conditions."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from itertools import product
 from typing import Any
 
 from hal.base.errors import InvalidValueError
-from sim_twin.benchmark.episodes.clutter import MOST, draw_neighbours
+from sim_twin.benchmark.episodes.clutter import MAX_NEIGHBOURS, draw_neighbours
 from sim_twin.benchmark.episodes.physics import Physics
 from sim_twin.model.objects import EXTENDED_OBJECTS, OBJECT_NAMES, PAPER_OBJECTS
 from sim_twin.model.parts import GraspObject
@@ -27,7 +27,7 @@ PITCHES_DEG = (-45.0, 0.0, 45.0)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scenario:
-    """One episode's circumstances; with the code's version they determine it wholly."""
+    """Conditions of one episode; with the code's version they determine it fully."""
 
     object: str
     """One of `sim_twin.model.objects.OBJECT_NAMES`, or the name of `shape`."""
@@ -38,31 +38,41 @@ class Scenario:
     pitch_deg: float
     """Lean of the object [°]."""
     seed: int = 0
-    """Of the camera's noise, of the generator and of everything drawn below."""
+    """Seed of the camera's noise, of the generator and of everything sampled below."""
     occlusion: float = 0.0
-    """Share of the object's pixels hidden from the camera."""
+    """Ratio of the object's pixels that are occluded."""
     clutter: int = 0
-    """How many neighbours stand beside the object."""
+    """Number of neighbours around the object."""
     physics_noise: bool = False
-    """Whether friction, mass, the camera's mount and the arm's promptness are off what the runtime believes."""
+    """Whether friction, mass, extrinsics and actuation latency differ from the runtime's model."""
     shape: GraspObject | None = field(default=None, repr=False)
-    """The object itself, where it is none of the named ones; its name must say all of it (see `features`)."""
+    """Shape of an object that is none of the named ones; its name must identify it (see `columns`)."""
 
     def __post_init__(self) -> None:
         if self.shape is None:
-            _one_of("object", self.object, OBJECT_NAMES)
-        _one_of("distance", self.distance, tuple(DISTANCES_M))
-        _one_of("lateral", self.lateral, tuple(LATERALS_M))
+            _check_choice("object", self.object, OBJECT_NAMES)
+        _check_choice("distance", self.distance, tuple(DISTANCES_M))
+        _check_choice("lateral", self.lateral, tuple(LATERALS_M))
         if not 0.0 <= self.occlusion < 1.0:
-            raise InvalidValueError(f"occlusion is {self.occlusion!r}; allowed is 0 up to, not including, 1.")
+            raise InvalidValueError(
+                f"scenario: occlusion is out of range ({self.occlusion!r}, allowed 0 up to, not including, 1). "
+                "Lower it.",
+                code="scenario_occlusion",
+            )
         if self.seed < 0:
-            raise InvalidValueError(f"seed is {self.seed}; allowed is 0 or more.")
-        if not 0 <= self.clutter <= MOST:
-            raise InvalidValueError(f"clutter is {self.clutter}; allowed is 0 to {MOST} neighbours.")
+            raise InvalidValueError(
+                f"scenario: seed is negative ({self.seed}, allowed 0 or more). Give 0 or more.", code="scenario_seed"
+            )
+        if not 0 <= self.clutter <= MAX_NEIGHBOURS:
+            raise InvalidValueError(
+                f"scenario: clutter is out of range ({self.clutter}, allowed 0 to {MAX_NEIGHBOURS} neighbours). "
+                "Give fewer.",
+                code="scenario_clutter",
+            )
 
     @property
     def key(self) -> str:
-        """A name for it that is unique and the same in every run."""
+        """Unique name, the same in every run."""
         more = f"-occluded{self.occlusion:g}" if self.occlusion else ""
         more += f"-clutter{self.clutter}" if self.clutter else ""
         more += "-noisy" if self.physics_noise else ""
@@ -70,13 +80,13 @@ class Scenario:
 
     @property
     def draw_seed(self) -> int:
-        """A seed of this scenario's own, so that no two share their noise."""
+        """Seed of this scenario alone, so that no two have the same noise."""
         return int.from_bytes(hashlib.sha256(self.key.encode()).digest()[:4], "big")
 
     @property
     def physics(self) -> Physics:
-        """What the world has otherwise than the runtime believes."""
-        return Physics.drawn(self.draw_seed) if self.physics_noise else Physics()
+        """Deviations of the world from the runtime's model."""
+        return Physics.sample(self.draw_seed) if self.physics_noise else Physics()
 
     def scene(self) -> SceneConfig:
         """Return the twin's scene."""
@@ -92,13 +102,13 @@ class Scenario:
         return replace(alone, neighbours=draw_neighbours(alone, self.clutter, self._others(), self.draw_seed))
 
     def _others(self) -> list[str]:
-        """Return what may stand beside the object: others of its set, so that its class tells it from them."""
+        """Return possible neighbours: other objects of its set, so that its class identifies it."""
         own_set = EXTENDED_OBJECTS if self.object in EXTENDED_OBJECTS else PAPER_OBJECTS
         return [name for name in own_set if name != self.object]
 
     @classmethod
-    def of(cls, row: Mapping[str, Any], shapes: Mapping[str, GraspObject] | None = None) -> Scenario:
-        """Return the scenario of a table's row: what `features` gave, maybe among other columns.
+    def from_row(cls, row: Mapping[str, Any], shapes: Mapping[str, GraspObject] | None = None) -> Scenario:
+        """Return the scenario of a table's row: what `columns` gave, maybe among other columns.
 
         Args:
             row: column to value; one of an earlier version may lack what has a default.
@@ -108,11 +118,15 @@ class Scenario:
         known = {name: row[name] for name in columns if row.get(name) is not None}
         return cls(**known, shape=(shapes or {}).get(row["object"]))
 
-    def features(self) -> dict[str, object]:
-        """Return what identifies it and what was drawn for it, as columns of a table."""
+    def identity(self) -> dict[str, object]:
+        """Return the key, the fields and the sampled physics as columns of a table; `scene()` is not needed for it."""
         own = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "shape"}
+        return {"scenario": self.key, **own, **asdict(self.physics)}
+
+    def columns(self) -> dict[str, object]:
+        """Return the identity and the sampled neighbours as columns of a table."""
         neighbours = [neighbour.object for neighbour in self.scene().neighbours] if self.clutter else []
-        return {"scenario": self.key, **own, **asdict(self.physics), "neighbours": neighbours}
+        return {**self.identity(), "neighbours": neighbours}
 
 
 def grid(
@@ -148,6 +162,9 @@ def grid(
     ]
 
 
-def _one_of(name: str, value: str, allowed: Sequence[str]) -> None:
+def _check_choice(name: str, value: str, allowed: Sequence[str]) -> None:
     if value not in allowed:
-        raise InvalidValueError(f"there is no {name} {value!r}; choose one of: {', '.join(allowed)}.")
+        raise InvalidValueError(
+            f"scenario: {name} is unknown ({value!r}, allowed {', '.join(allowed)}). Choose one of these.",
+            code=f"scenario_{name}",
+        )

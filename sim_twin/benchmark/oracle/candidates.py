@@ -1,4 +1,4 @@
-"""Grasps on an object whose every side is known: pairs of contacts that face each other, from all directions."""
+"""Grasps on a fully known object: pairs of opposed contacts, approached from all directions."""
 
 from __future__ import annotations
 
@@ -13,36 +13,36 @@ from sim_twin.benchmark.oracle.surface import Surface
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SweepConfig:
-    """How densely grasps are laid over an object."""
+    """Density of the grasps swept over an object."""
 
     n_points: int = 400
     """Places on the surface where a pad may press."""
     n_directions: int = 3
-    """Ways through the object from each place: the normal, and others inside the friction cone."""
+    """Closing directions from each place: the normal, and others inside the friction cone."""
     cone_rad: float = 0.40
     """Greatest angle between the closing direction and a contact's normal [rad]."""
     max_width_m: float = 0.080
-    """Widest pair; the gripper has the last word on its width [m]."""
+    """Maximum width of a pair [m]; the gripper checks its own maximum later."""
     n_approaches: int = 12
     """Approaches around each pair, all the way round."""
     max_rise: float = 0.35
     """Greatest sine of the angle by which an approach may come from below."""
     depths_m: tuple[float, ...] = (0.0,)
-    """How far beyond the pair the grasp is laid [m]."""
+    """Distances of the grasp's origin beyond the pair [m]."""
     cell_m: float = 0.015
-    """Pairs whose middles share a cube of this edge, and whose closing directions a cell, are one [m]."""
+    """Edge of a cell of middles [m]: of pairs in one cell, with closing directions in one cell, the best is kept."""
     cell_sine: float = 0.4
     """Edge of a cell of closing directions."""
     seed: int = 0
 
 
 def sweep_grasps(surface: Surface, T_base_object: np.ndarray, contact_depth_m: float, config: SweepConfig) -> GraspSet:
-    """Return grasps all over the object, in the base frame; the scores say how squarely their contacts face.
+    """Return grasps all over the object, in the base frame; the scores are the squareness of their contacts.
 
     Args:
         surface: of the object, in its own frame.
         T_base_object: (4, 4).
-        contact_depth_m: how far a grasp's origin lies beyond its contacts [m].
+        contact_depth_m: distance of a grasp's origin beyond its contacts [m].
         config: how many.
     """
     middles, closings, widths, squareness = _pairs(surface, config)
@@ -58,17 +58,17 @@ def sweep_grasps(surface: Surface, T_base_object: np.ndarray, contact_depth_m: f
 
 
 def _pairs(surface: Surface, config: SweepConfig) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return middles (K, 3), closing directions (K, 3), widths (K,) [m] and how squarely they face (K,), in [0, 1]."""
+    """Return middles (K, 3), closing directions (K, 3), widths (K,) [m] and squareness (K,) in [0, 1]."""
     rng = np.random.default_rng(config.seed)
     contacts = surface.sample(0.002, config.seed)
     chosen = rng.permutation(len(contacts.points))[: config.n_points]
     points = np.repeat(contacts.points[chosen], config.n_directions, axis=0)
     normals = np.repeat(contacts.normals[chosen], config.n_directions, axis=0)
-    aside = rng.normal(size=points.shape) * np.tan(config.cone_rad) / 1.5
-    aside[:: config.n_directions] = 0.0
-    directions = _unit(aside - normals)
+    tangents = rng.normal(size=points.shape) * np.tan(config.cone_rad) / 1.5
+    tangents[:: config.n_directions] = 0.0
+    directions = _unit(tangents - normals)
     here = -np.sum(directions * normals, axis=1)
-    ends = surface.chords(points, directions)
+    ends = surface.trace_chords(points, directions)
     found = []
     for end in ends:
         there = np.sum(directions * end.normals, axis=1)
@@ -78,12 +78,12 @@ def _pairs(surface: Surface, config: SweepConfig) -> tuple[np.ndarray, np.ndarra
         found.append((0.5 * (points + end.points), directions, widths, 1.0 - angle / config.cone_rad, good))
     middles, directions, widths, square, good = (np.concatenate(parts) for parts in zip(*found, strict=True))
     middles, directions, widths, square = middles[good], directions[good], widths[good], square[good]
-    kept = _one_of_each(middles, directions, square, config)
+    kept = _deduplicate(middles, directions, square, config)
     return middles[kept], directions[kept], widths[kept], square[kept]
 
 
-def _one_of_each(middles: np.ndarray, directions: np.ndarray, scores: np.ndarray, config: SweepConfig) -> np.ndarray:
-    """Return the indices of the best of each cell of middles (K, 3) and directions (K, 3), whose sign means nothing."""
+def _deduplicate(middles: np.ndarray, directions: np.ndarray, scores: np.ndarray, config: SweepConfig) -> np.ndarray:
+    """Return the indices of the best of each cell of middles (K, 3) and directions (K, 3), whose sign is arbitrary."""
     upwards = directions * np.where(directions @ [0.31, 0.47, 0.83] < 0.0, -1.0, 1.0)[:, None]
     cells = np.column_stack([np.floor(middles / config.cell_m), np.round(upwards / config.cell_sine)]).astype(int)
     best_first = np.argsort(-scores, kind="stable")
@@ -92,7 +92,7 @@ def _one_of_each(middles: np.ndarray, directions: np.ndarray, scores: np.ndarray
 
 
 def _approaches(closings: np.ndarray, config: SweepConfig) -> tuple[np.ndarray, np.ndarray]:
-    """Return which pair (M,) each of the approaches (M, 3) belongs to; one of them is as frontal as can be."""
+    """Return which pair (M,) each of the approaches (M, 3) belongs to; one of them is as frontal as possible."""
     front = np.array([1.0, 0.0, 0.0]) - closings[:, :1] * closings
     above = np.array([0.0, 0.0, -1.0]) + closings[:, 2:] * closings
     start = _unit(np.where(np.linalg.norm(front, axis=1, keepdims=True) > 0.2, front, above))

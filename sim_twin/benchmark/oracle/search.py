@@ -1,7 +1,7 @@
-"""What can be solved at all: grasps swept over the true object, and the best of each kind executed until one holds.
+"""Search for solvable scenarios: grasps swept over the object's true shape, executed until one holds.
 
-The oracle sees no picture: it is told the object's shape and pose. Whatever passes the planner's own checks against the
-true scene is executed in a fresh world, one grasp after the other, each as unlike the failed ones as can be.
+The oracle uses no image: it has the object's true shape and pose. A grasp that passes the planner's own checks in the
+true scene is executed in a fresh world, one grasp after the other, each as dissimilar to the failed ones as possible.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from importlib.metadata import version
 
 from hal.base.clock import Stopwatch
 from hal.base.errors import InvalidValueError
+from sim_twin.benchmark.episodes.execution import EpisodeRobot, Mode, Outcome
 from sim_twin.benchmark.episodes.rows import Row
 from sim_twin.benchmark.episodes.scenarios import Scenario
-from sim_twin.benchmark.episodes.trial import Mode, Outcome, Robot
 from sim_twin.benchmark.oracle.candidates import SweepConfig
-from sim_twin.benchmark.oracle.options import EXACT_PLANNER, Options, TrueScene
+from sim_twin.benchmark.oracle.reachable_grasps import EXACT_PLANNER, GraspQueue, GroundTruthScene
 from z1_runtime.geometry.kinematics import Kinematics
 from z1_runtime.planning.planner_config import PlannerConfig
 from z1_runtime.types import GraspPlan, Rejection, RejectionReason
@@ -28,7 +28,7 @@ METHOD = "oracle"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OracleConfig:
-    """How long to search."""
+    """Budget and sweeps of a search."""
 
     executions: int = 40
     """Grasps that are executed, each in a fresh world, before a scenario counts as not solved."""
@@ -37,7 +37,7 @@ class OracleConfig:
     finer_after: int = 12
     """Failed executions after which the finer sweep is made."""
     sweep: SweepConfig = field(default_factory=SweepConfig)
-    """The sweep that is counted, and tried first."""
+    """The first sweep, whose grasps are counted."""
     finer: SweepConfig = field(
         default_factory=lambda: SweepConfig(
             n_points=900, n_approaches=24, depths_m=(0.0, 0.008), cell_m=0.010, cell_sine=0.3, seed=1
@@ -45,15 +45,17 @@ class OracleConfig:
     )
     """The sweep that follows where all of the first fails."""
     planner: PlannerConfig = EXACT_PLANNER
-    """What is a collision where everything is known exactly."""
+    """Planner settings for an exactly known scene."""
     speed: float = 0.5
     """Fraction of the arm's limits that motions use."""
 
     def __post_init__(self) -> None:
         if min(self.executions, self.plannings, self.finer_after) < 1:
             raise InvalidValueError(
-                "executions, plannings and finer_after are "
-                f"{self.executions}, {self.plannings} and {self.finer_after}; each must be 1 or more."
+                f"oracle: executions, plannings or finer_after is out of range ({self.executions}, "
+                f"{self.plannings} and "
+                f"{self.finer_after}, allowed 1 or more). Raise the budget.",
+                code="oracle_budget",
             )
 
 
@@ -71,68 +73,68 @@ def run_oracle_task(task: OracleTask) -> list[Row]:
 
 
 def search(scenario: Scenario, config: OracleConfig) -> Row:
-    """Look for a grasp that lifts the object of `scenario`; return what was found, as a table's row.
+    """Search for a grasp that lifts the object of `scenario`; return the result as a table's row.
 
     `success` says whether one did, `verdict` how the search ended: `solved`; `unsolved`, all that was executed failed;
-    `unreachable`, nothing can be executed. `executions` counts, `modes` names them in turn, and what else is told is
-    of the last one. `n_candidates`, `n_clear` and `n_reachable` are of the first sweep: the grasps, those with room for
-    the gripper, and the ways to lay it (two a grasp) that the arm can go.
+    `unreachable`, nothing can be executed. `executions` counts, `modes` names them in turn, and the other figures
+    are of the last one. `n_candidates`, `n_clear` and `n_reachable` are of the first sweep: the grasps, those with
+    clearance for the gripper, and the reachable placements (two per grasp).
     """
     watch = Stopwatch()
-    hunt = _Hunt(scenario, config)
-    for _ in hunt.run():
+    search_run = _Search(scenario, config)
+    for _ in search_run.run():
         pass
-    row: Row = {**scenario.features(), "method": METHOD, "version": version("z1-grasp")}
-    return row | hunt.report() | {"search_ms": watch.lap_ms()}
+    row: Row = {**scenario.columns(), "method": METHOD, "version": version("z1-grasp")}
+    return row | search_run.report() | {"search_ms": watch.lap_ms()}
 
 
-class _Hunt:
+class _Search:
     """One scenario's search."""
 
     def __init__(self, scenario: Scenario, config: OracleConfig) -> None:
         self._scene, self._config = scenario.scene(), config
-        self._truth = TrueScene(self._scene, _kinematics(), config.planner, config.speed)
-        self._counted: Options | None = None
+        self._ground_truth = GroundTruthScene(self._scene, _kinematics(), config.planner, config.speed)
+        self._counted: GraspQueue | None = None
         self._modes: list[Mode] = []
-        self._refused: Counter[str] = Counter()
+        self._rejected: Counter[str] = Counter()
         self._last: tuple[GraspPlan, Outcome] | None = None
         self._exhausted = False
 
     def run(self) -> Iterator[Outcome]:
         """Yield the outcome of each execution; end with the first success, or when options or budget are spent."""
-        options = self._counted = self._truth.options(self._config.sweep)
+        find_grasps = self._counted = self._ground_truth.find_grasps(self._config.sweep)
         finer = False
         while not self._is_over():
-            choice = None if not finer and len(self._modes) >= self._config.finer_after else options.next()
+            choice = None if not finer and len(self._modes) >= self._config.finer_after else find_grasps.next()
             if choice is None and finer:
                 self._exhausted = True
                 return
             if choice is None:
-                options, finer = options.joined(self._truth.options(self._config.finer)), True
+                find_grasps, finer = find_grasps.with_failures(self._ground_truth.find_grasps(self._config.finer)), True
                 continue
-            plan = self._truth.plan(choice)
+            plan = self._ground_truth.plan(choice)
             if isinstance(plan, Rejection):
-                self._refused[plan.reason] += 1
-                options.fail(choice)
+                self._rejected[plan.reason] += 1
+                find_grasps.add_failure(choice)
                 continue
             outcome = self._execute(plan)
-            options.fail(choice)
+            find_grasps.add_failure(choice)
             yield outcome
 
     def _is_over(self) -> bool:
         config = self._config
         solved = bool(self._modes) and self._modes[-1] is Mode.SUCCESS
-        return solved or len(self._modes) >= config.executions or self._refused.total() >= config.plannings
+        return solved or len(self._modes) >= config.executions or self._rejected.total() >= config.plannings
 
     def _execute(self, plan: GraspPlan) -> Outcome:
-        with Robot(self._scene, self._truth.kinematics, self._config.speed) as robot:
-            outcome = robot.act(plan)
+        with EpisodeRobot(self._scene, self._ground_truth.kinematics, self._config.speed) as robot:
+            outcome = robot.execute(plan)
         self._modes.append(outcome.mode)
         self._last = plan, outcome
         return outcome
 
     def report(self) -> Row:
-        """Return what was found as columns."""
+        """Return the result as columns."""
         counted = self._counted
         assert counted is not None, "nothing was searched"
         success = bool(self._modes) and self._modes[-1] is Mode.SUCCESS
@@ -146,7 +148,7 @@ class _Hunt:
             "n_clear": counted.n_clear,
             "n_reachable": len(counted),
         }
-        row |= {f"rejected_{reason}": counted.rejected[reason] + self._refused[reason] for reason in RejectionReason}
+        row |= {f"rejected_{reason}": counted.rejected[reason] + self._rejected[reason] for reason in RejectionReason}
         if self._last is None:
             return row
         plan, outcome = self._last

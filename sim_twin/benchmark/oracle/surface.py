@@ -1,4 +1,4 @@
-"""An object's true surface: points with normals on all its sides, and the chords that run through it."""
+"""An object's true surface: points with normals on all its sides, and the chords through it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _SAME_M = 1e-6
 
 
 class Contacts(NamedTuple):
-    """Where N pads could press, in the object's frame."""
+    """N possible contacts of a pad, in the object's frame."""
 
     points: np.ndarray
     """(N, 3) [m]."""
@@ -35,7 +35,7 @@ class _Hull:
     areas: np.ndarray  # (T,) [m²]
 
     @classmethod
-    def around(cls, corners: np.ndarray) -> _Hull:
+    def from_corners(cls, corners: np.ndarray) -> _Hull:
         hull = ConvexHull(corners)
         facets = np.unique(np.round(hull.equations, 9), axis=0)
         triangles = hull.points[hull.simplices]
@@ -43,11 +43,11 @@ class _Hull:
         areas = 0.5 * np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
         return cls(facets[:, :3], -facets[:, 3], triangles, hull.equations[:, :3], areas)
 
-    def holds(self, points: np.ndarray) -> np.ndarray:
+    def contains(self, points: np.ndarray) -> np.ndarray:
         """Return (N,) whether each of `points` (N, 3) is inside."""
         return np.all(points @ self.normals.T <= self.offsets, axis=1)
 
-    def cut(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def intersect(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return where rays (N, 3) enter and leave (N,) [m], and the facets (N,) they leave by; a miss leaves before
         it enters."""
         rate = directions @ self.normals.T
@@ -61,14 +61,14 @@ class _Hull:
 
 
 class Surface:
-    """The outside of an object that is made of convex parts.
+    """Outer surface of an object made of convex parts.
 
     Args:
         thing: the object.
     """
 
-    def __init__(self, thing: GraspObject) -> None:
-        self._hulls = [_Hull.around(part.corners()) for part in thing.parts]
+    def __init__(self, grasp_object: GraspObject) -> None:
+        self._hulls = [_Hull.from_corners(part.corners()) for part in grasp_object.parts]
 
     def sample(self, spacing_m: float, seed: int = 0) -> Contacts:
         """Return points spread at random over the whole outside, one for each `spacing_m` × `spacing_m` [m]."""
@@ -81,23 +81,25 @@ class Surface:
             weights = np.column_stack([1.0 - u, u * (1.0 - v), u * v])
             p = np.einsum("nk,nkd->nd", weights, hull.triangles[which])
             outside = p + _NUDGE_M * hull.facing[which]
-            bare = np.ones(count, dtype=bool)
+            exposed = np.ones(count, dtype=bool)
             for other in self._hulls[:own] + self._hulls[own + 1 :]:
-                bare &= ~other.holds(outside)
-            points.append(p[bare])
-            normals.append(hull.facing[which][bare])
+                exposed &= ~other.contains(outside)
+            points.append(p[exposed])
+            normals.append(hull.facing[which][exposed])
         return Contacts(np.concatenate(points), np.concatenate(normals))
 
-    def chords(self, origins: np.ndarray, directions: np.ndarray) -> tuple[Contacts, Contacts]:
-        """Return where rays that start on the surface and go inwards come out: of the first wall, and for good.
+    def trace_chords(self, origins: np.ndarray, directions: np.ndarray) -> tuple[Contacts, Contacts]:
+        """Return where rays that start on the surface and go inwards come out: of the first wall, and of the last.
 
         Args:
             origins: (N, 3) [m].
             directions: (N, 3) unit vectors.
         """
-        cuts = [hull.cut(origins, directions) for hull in self._hulls]
-        enters, leaves = (np.stack([cut[k] for cut in cuts], axis=1) for k in range(2))
-        normals = np.stack([h.normals[cut[2]] for h, cut in zip(self._hulls, cuts, strict=True)], axis=1)  # (N, P, 3)
+        intersections = [hull.intersect(origins, directions) for hull in self._hulls]
+        enters, leaves = (np.stack([intersect[k] for intersect in intersections], axis=1) for k in range(2))
+        normals = np.stack(
+            [h.normals[intersect[2]] for h, intersect in zip(self._hulls, intersections, strict=True)], axis=1
+        )  # (N, P, 3)
         met = leaves > np.maximum(enters, 0.0) + _SAME_M
         rows = np.arange(len(origins))
         last = np.where(met, leaves, -np.inf).argmax(axis=1)

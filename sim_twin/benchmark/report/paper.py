@@ -1,4 +1,4 @@
-"""The paper's own figures that are known here; of its breakdowns none is.
+"""The paper's figures as far as they are published; its breakdowns are not.
 
 MVB-Grasp (Poudel, Basit, Shafique), 81 MuJoCo episodes of three objects in 27 poses; its times were taken on a GPU.
 """

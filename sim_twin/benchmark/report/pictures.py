@@ -1,4 +1,4 @@
-"""Pictures of how episodes ended, drawn afterwards from what their rows hold."""
+"""Pictures of the final states of episodes, rendered from their rows."""
 
 from __future__ import annotations
 
@@ -21,35 +21,34 @@ from sim_twin.model.parts import GraspObject
 
 Choice = Literal["failures", "all", "none"]
 SHOWN = 12
-"""How many failures the report shows."""
+"""Failures that the report shows."""
 _SIZE, _SMALL = (960, 540), (480, 270)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Picture:
-    """What the report shows of one episode."""
+class EpisodePicture:
+    """One episode's picture in the report."""
 
-    words: str
-    """Said below it."""
+    caption: str
     jpeg: bytes
-    """A small JPEG file."""
+    """Small JPEG file."""
     recording: str = ""
-    """Its .rrd file, from the report's folder; empty where there is none."""
+    """Its .rrd file, relative to the report's folder; empty where there is none."""
 
 
 def draw_pictures(
     rows: Sequence[Row], choice: Choice, folder: Path, shapes: Mapping[str, GraspObject] | None = None
-) -> list[tuple[Row, Picture]]:
-    """Draw the final state of episodes as <scenario>-<method>.png in `folder`.
+) -> list[tuple[Row, EpisodePicture]]:
+    """Render the final state of episodes as <scenario>-<method>.png in `folder`.
 
     Args:
         rows: of any methods; an episode in which the arm never moved has no final state and no picture.
         choice: `failures` draws those that the report shows, `all` every episode.
-        folder: is made.
-        shapes: the objects that are none of the named ones, by name; others than these cannot be drawn.
+        folder: is created.
+        shapes: the objects that are none of the named ones, by name; no others can be drawn.
 
     Returns:
-        What the report shows, and the rows it is of.
+        The rows that the report shows, with their pictures.
     """
     if choice == "none":
         return []
@@ -59,29 +58,29 @@ def draw_pictures(
     folder.mkdir(parents=True, exist_ok=True)
     pictures = []
     for row in rows if choice == "all" else shown:
-        png = draw_picture(Scenario.of(row, shapes).scene(), np.array(row["final_qpos"]), *_SIZE)
+        png = draw_picture(Scenario.from_row(row, shapes).scene(), np.array(row["final_qpos"]), *_SIZE)
         (folder / f"{row['scenario']}-{file_name(row['method'])}.png").write_bytes(png)
         if row in shown:
-            words = f"{row['scenario']}, {row['method']}: {row['mode']}"
-            pictures.append((row, Picture(words=words, jpeg=_small_jpeg(png))))
+            caption = f"{row['scenario']}, {row['method']}: {row['mode']}"
+            pictures.append((row, EpisodePicture(caption=caption, jpeg=_encode_thumbnail(png))))
     return pictures
 
 
-def choose_failures(rows: Sequence[Row], most: int = SHOWN) -> list[Row]:
-    """Return failures in which the arm moved, as different as can be: each method's failure modes take turns."""
+def choose_failures(rows: Sequence[Row], maximum: int = SHOWN) -> list[Row]:
+    """Return failures in which the arm moved, of as many kinds as possible: each method's failure modes in turn."""
     kinds: dict[tuple[str, str], list[Row]] = {}
     for row in rows:
         if not row["success"] and row.get("final_qpos") is not None:
             kinds.setdefault((row["method"], row["mode"]), []).append(row)
     turns = chain.from_iterable(zip_longest(*kinds.values()))
-    return [row for row in turns if row is not None][:most]
+    return [row for row in turns if row is not None][:maximum]
 
 
 def _can_be_drawn(row: Row, shapes: Mapping[str, GraspObject]) -> bool:
     return row.get("final_qpos") is not None and (row["object"] in OBJECTS or row["object"] in shapes)
 
 
-def _small_jpeg(png: bytes) -> bytes:
+def _encode_thumbnail(png: bytes) -> bytes:
     file = io.BytesIO()
     Image.open(io.BytesIO(png)).convert("RGB").resize(_SMALL, Image.Resampling.LANCZOS).save(file, "JPEG", quality=80)
     return file.getvalue()

@@ -1,37 +1,38 @@
-"""The statistics that a comparison of success rates needs."""
+"""Statistics of a comparison of success rates."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import binom
+from scipy.stats import binomtest
 
 from hal.base.errors import InvalidValueError
 
 
 class Interval(NamedTuple):
-    """A range of rates."""
+    """Bounds of a rate."""
 
     low: float
     high: float
 
 
-def wilson(successes: int, trials: int, z: float = 1.96) -> Interval:
-    """Return the Wilson score interval of a rate (Wilson 1927), by default of 95 %.
+def wilson(successes: int, trials: int) -> Interval:
+    """Return the 95 % Wilson score interval of a rate (Wilson 1927).
 
     Raises:
-        ValueError: the counts contradict each other.
+        InvalidValueError: the counts contradict each other.
     """
     if not 0 <= successes <= trials:
-        raise InvalidValueError(f"{successes} successes in {trials} trials cannot be.")
+        raise InvalidValueError(
+            f"success rate: the counts are {successes} of {trials} trials, allowed are 0 to {trials} successes. "
+            "Count successes and trials of the same rows.",
+            code="invalid_counts",
+        )
     if trials == 0:
         return Interval(0.0, 1.0)
-    rate = successes / trials
-    centre = rate + z * z / (2.0 * trials)
-    half = z * np.sqrt(rate * (1.0 - rate) / trials + z * z / (4.0 * trials * trials))
-    scale = 1.0 + z * z / trials
-    return Interval(float(max((centre - half) / scale, 0.0)), float(min((centre + half) / scale, 1.0)))
+    interval = binomtest(successes, trials).proportion_ci(method="wilson")
+    return Interval(float(interval.low), float(interval.high))
 
 
 class McNemar(NamedTuple):
@@ -49,29 +50,35 @@ def mcnemar(first: np.ndarray, second: np.ndarray) -> McNemar:
     """Compare successes (N,) bool of two methods, scenario by scenario.
 
     Raises:
-        ValueError: the lengths differ.
+        InvalidValueError: the lengths differ.
     """
     first, second = np.asarray(first, dtype=bool), np.asarray(second, dtype=bool)
     if first.shape != second.shape:
-        raise InvalidValueError(f"{first.shape} and {second.shape}: paired methods need the very same scenarios.")
+        raise InvalidValueError(
+            f"McNemar's test: the shapes are {first.shape} and {second.shape}, allowed are equal ones. "
+            "Give both methods the same scenarios.",
+            code="unpaired",
+        )
     b, c = int((first & ~second).sum()), int((~first & second).sum())
-    p = min(1.0, 2.0 * float(binom.cdf(min(b, c), b + c, 0.5))) if b + c else 1.0
-    return McNemar(b, c, p)
+    return McNemar(b, c, float(binomtest(min(b, c), b + c).pvalue) if b + c else 1.0)
 
 
 def paired_difference(first: np.ndarray, second: np.ndarray) -> Interval:
-    """Return the 95 % interval of the first's rate less the second's, on the very same scenarios (N,) bool.
+    """Return the 95 % interval of the first's rate minus the second's, on the same scenarios (N,) bool.
 
     Newcombe's score interval for paired proportions (Statistics in Medicine 17, 1998, method 10): Wilson's intervals of
-    both rates, joined by how much the two agree.
+    both rates, combined by the correlation of the two.
 
     Raises:
-        ValueError: the lengths differ, or there is no scenario.
+        InvalidValueError: the lengths differ, or there is no scenario.
     """
     b, c, _ = mcnemar(first, second)
     n = len(first)
     if not n:
-        raise InvalidValueError("a difference needs scenarios that both methods ran.")
+        raise InvalidValueError(
+            "paired difference: no scenario is shared (0, allowed 1 or more). Run both methods on the same scenarios.",
+            code="no_scenarios",
+        )
     both = int((np.asarray(first, dtype=bool) & np.asarray(second, dtype=bool)).sum())
     neither = n - both - b - c
     rates = (both + b) / n, (both + c) / n

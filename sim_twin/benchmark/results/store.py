@@ -1,8 +1,8 @@
-"""Rows on disk: a folder of small Parquet files, one a scenario, that any Parquet reader takes for one table.
+"""Rows on disk: a folder of small Parquet files, one per scenario, that Parquet readers read as one table.
 
-A Parquet file cannot be appended to, and one that was half written cannot be read. So each scenario's rows go into a
-file of their own, which appears under its name only when it is whole: a run that is killed loses the scenarios in
-flight and nothing else, and `--resume` goes on with those that are missing.
+A Parquet file cannot be appended to, and a partial one cannot be read. So each scenario's rows go into a file of their
+own, which appears under its name once complete: a killed run loses only the scenarios in flight, and `--resume`
+continues with the missing ones.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from hal.base.errors import OutputExistsError
-from sim_twin.benchmark.episodes.rows import Row
+from sim_twin.benchmark.episodes.rows import TRACEBACK, Row
 
-FOLDER, TABLE = "episodes", "episodes.parquet"
+FOLDER, TABLE, ERROR_LOG = "episodes", "episodes.parquet", "errors.log"
 _LONGEST_NAME = 100
 
 
@@ -26,42 +26,54 @@ class Store:
     """The rows of one run, in `out`.
 
     Raises:
-        FileExistsError: there are rows already and `resume` is False.
+        OutputExistsError: there are rows already and `resume` is False.
     """
 
     def __init__(self, out: Path, resume: bool) -> None:
         self._folder = out / FOLDER
         self._table = out / TABLE
+        self._errors = out / ERROR_LOG
         if not resume and any(self._folder.glob("*.parquet")):
             raise OutputExistsError(
-                f"{out} holds the episodes of an earlier run; add --resume to go on with it, or give another --out."
+                f"store: {out} has the episodes of an earlier run. Add --resume to continue it, or give another --out."
             )
         self._folder.mkdir(parents=True, exist_ok=True)
         for partial in self._folder.glob("*.partial"):
             partial.unlink()
 
     def done(self) -> set[tuple[str, str]]:
-        """Return which (scenario, method) pairs have a row."""
+        """Return the (scenario, method) pairs with a row."""
         return {(row["scenario"], row["method"]) for row in self.rows([])}
 
     def add(self, rows: Iterable[Row]) -> None:
-        """Keep the rows of one scenario; on return they are on the disk."""
+        """Keep the rows of one scenario; on return they are on the disk.
+
+        Tracebacks of error rows go to `ERROR_LOG`, not into the table.
+        """
         rows = list(rows)
+        self._log_errors(rows)
+        rows = [{name: value for name, value in row.items() if name != TRACEBACK} for row in rows]
         methods = "+".join(sorted(str(row["method"]).replace(":", "_").replace("=", "") for row in rows))
         if len(methods) > _LONGEST_NAME or "/" in methods:  # many variants, or one with the path of its scoring
             methods = hashlib.sha256(methods.encode()).hexdigest()[:16]
         path = self._folder / f"{rows[0]['scenario']}-{methods}.parquet"
         partial = path.with_suffix(".partial")
-        pq.write_table(pa.Table.from_pylist(_even(rows)), partial)
+        pq.write_table(pa.Table.from_pylist(_align_columns(rows)), partial)
         with partial.open("rb") as file:
             os.fsync(file.fileno())
         partial.replace(path)
+
+    def _log_errors(self, rows: Iterable[Row]) -> None:
+        entries = [f"{row['scenario']}, {row['method']}\n{row[TRACEBACK]}\n" for row in rows if TRACEBACK in row]
+        if entries:
+            with self._errors.open("a", encoding="utf-8") as file:
+                file.writelines(entries)
 
     def rows(self, columns: list[str] | None = None) -> list[Row]:
         """Return all rows, sorted by scenario and method; columns that a row lacks are None.
 
         Args:
-            columns: what is wanted besides scenario and method; None is all.
+            columns: in addition to scenario and method; None is all.
         """
         if columns is not None:
             columns = ["scenario", "method", *columns]
@@ -72,14 +84,14 @@ class Store:
         return sorted(rows, key=lambda row: (row["scenario"], row["method"]))
 
     def write_table(self) -> Path:
-        """Write all rows as one file beside the folder and return its path."""
+        """Write all rows as one file next to the folder and return its path."""
         partial = self._table.with_suffix(".partial")
-        pq.write_table(pa.Table.from_pylist(_even(self.rows())), partial)
+        pq.write_table(pa.Table.from_pylist(_align_columns(self.rows())), partial)
         partial.replace(self._table)
         return self._table
 
 
-def _even(rows: list[Row]) -> list[Row]:
+def _align_columns(rows: list[Row]) -> list[Row]:
     """Return `rows` with the same columns in each."""
     names = list(dict.fromkeys(name for row in rows for name in row))
     return [{name: row.get(name) for name in names} for row in rows]

@@ -1,4 +1,4 @@
-"""From rows to the figures people compare: rates with intervals, by condition, and methods against each other."""
+"""Summary of rows: success rates with intervals, by condition, and methods against each other."""
 
 from __future__ import annotations
 
@@ -11,13 +11,14 @@ from typing import Any
 
 import numpy as np
 
+from sim_twin.benchmark.episodes.execution import Mode
 from sim_twin.benchmark.episodes.rows import Row
 from sim_twin.benchmark.results.stats import mcnemar, paired_difference, wilson
 
 CONDITIONS = ("object", "distance", "lateral", "pitch_deg", "occlusion", "clutter", "physics_noise")
 """Columns by which success is broken down."""
 STAGES = ("detect_ms", "cloud_ms", "generate_ms", "filter_ms", "rank_ms", "collision_ms", "ik_ms", "plan_ms")
-"""Columns that hold a decision's times."""
+"""Columns of a decision's times."""
 _COUNTS = ("n_candidates", "n_free", "n_ranked", "rank")
 
 
@@ -35,7 +36,7 @@ _READINGS = {"fallthrough": "success", "top1": "success_top1"}
 
 
 def summarise_method(rows: Sequence[Row]) -> dict[str, Any]:
-    """Return what one method's rows amount to."""
+    """Return the summary of one method's rows."""
     n, successes, top1 = len(rows), *(_count(rows, column) for column in _READINGS.values())
     return {
         "episodes": n,
@@ -46,6 +47,7 @@ def summarise_method(rows: Sequence[Row]) -> dict[str, Any]:
         "rate_top1": top1 / n if n else float("nan"),
         "rate_top1_95": wilson(top1, n),
         "rate_after": _rates_after(rows),
+        "errors": sum(row["mode"] == Mode.ERROR.value for row in rows),
         "modes": dict(Counter(row["mode"] for row in rows).most_common()),
         "by": {column: _breakdown(rows, column) for column in CONDITIONS},
         "counts": {column: _median(rows, column) for column in _COUNTS},
@@ -54,7 +56,7 @@ def summarise_method(rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def write_summary(rows: Sequence[Row], path: Path, run: dict[str, Any]) -> dict[str, Any]:
-    """Write summary.json at `path`, with `run` saying what was run, and return its content."""
+    """Write summary.json at `path`, with the settings `run`, and return its content."""
     content = {"run": run, **summarise(rows)}
     partial = path.with_suffix(".partial")
     partial.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n")
@@ -89,10 +91,10 @@ def _breakdown(rows: Sequence[Row], column: str) -> dict[str, dict[str, Any]]:
 
 
 def _rates_after(rows: Sequence[Row]) -> list[float]:
-    """Return the rate of success within one, two, … attempts, as many as any row had."""
+    """Return the rate of success within one, two, … attempts, up to the maximum of any row."""
     after = [row["success_after"] for row in rows if row.get("success_after")]
-    most = max(map(len, after), default=0)
-    return [float(np.mean([flags[min(k, len(flags) - 1)] for flags in after])) for k in range(most)]
+    maximum = max(map(len, after), default=0)
+    return [float(np.mean([flags[min(k, len(flags) - 1)] for flags in after])) for k in range(maximum)]
 
 
 def _compare(a: str, b: str, by_method: dict[str, list[Row]], reading: str) -> dict[str, Any]:

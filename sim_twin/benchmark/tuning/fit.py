@@ -1,11 +1,11 @@
-"""Offline calibration: proposes the numbers of a ranking from logged episodes, and keeps them only if they win.
+"""Offline calibration of a ranking: numbers proposed from logged episodes, kept only if they win.
 
-For `mvb` and for `full` apart, k, α and the box come from the variants that were logged, since only episodes say what
-another choice leads to; thresholds and a scoring head come from what was measured of the grasps whose outcome is known.
+For `mvb` and for `full` apart, k, α and the box come from the logged variants, since only episodes show the
+result of another choice; thresholds and a scoring head come from the features of grasps with a known outcome.
 
-What is proposed so is judged by episodes on seeds that it was not fitted to, against the values set by hand, on the
-very same candidates. A proposal wins if it has more successes under the reading that is tuned for, if McNemar's exact
-test says so at 0.05 shared among the proposals of that method, and if it has no fewer under the other reading.
+Each proposal is evaluated by episodes on held-out seeds, against the values set by hand, on the same candidates. It
+wins if it has more successes under the reading that is tuned for, if McNemar's exact test is significant at 0.05
+divided among the proposals of that method, and if it loses at most 2 % under the other reading.
 """
 
 from __future__ import annotations
@@ -20,24 +20,24 @@ import numpy as np
 from sim_twin.benchmark.episodes.methods import Method, parse_method
 from sim_twin.benchmark.episodes.rows import Row
 from sim_twin.benchmark.episodes.scenarios import Scenario
+from sim_twin.benchmark.tuning.evaluation import Proposal, describe_verdict, evaluate_proposals, select_best
 from sim_twin.benchmark.tuning.head import HeadReport, fit_head
-from sim_twin.benchmark.tuning.judge import Proposal, best_of, judge, verdict
-from sim_twin.benchmark.tuning.proposals import FAMILIES, Draft, draft, hand_ranking
-from sim_twin.benchmark.tuning.rows import Logs, Reading, TuneError, pose_of, samples_of
+from sim_twin.benchmark.tuning.logged_episodes import Logs, Reading, TuneError, extract_samples, scenario_pose
+from sim_twin.benchmark.tuning.proposals import FAMILIES, Draft, baseline_ranking, draft
 from z1_runtime.grasping.ranking import Ranking, Scoring
 
 RunEpisodes = Callable[[Sequence[Method], Sequence[Scenario], set[tuple[str, str]]], list[Row]]
-"""Runs methods in scenarios, but not the (scenario, method) pairs of the third argument; returns the new rows."""
+"""Run methods in scenarios, without the (scenario, method) pairs of the third argument; return the new rows."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Family:
-    """What tuning came to for one method."""
+    """Result of the tuning for one method."""
 
     draft: Draft
-    """What was fitted."""
+    """Fitted to the training rows."""
     proposals: tuple[Proposal, ...]
-    """The draft's, judged."""
+    """The draft's, with their results on the held-out seeds."""
     kept: Ranking
     tuned: bool
     """Whether `kept` is a proposal."""
@@ -47,7 +47,7 @@ class Family:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Tuning:
-    """All that tuning found."""
+    """Result of the tuning."""
 
     reading: Reading
     train_seeds: tuple[int, ...]
@@ -55,21 +55,21 @@ class Tuning:
     families: Mapping[str, Family]
     head: HeadReport | None
     head_note: str
-    """Why there is no head, or what it was fitted to."""
+    """Reason for no head, or the number of grasps it was fitted to."""
     scoring: Scoring
 
 
 def tune(
     logs: Logs, *, held_out_seeds: Sequence[int], reading: Reading, folder: Path, run: RunEpisodes | None, head: bool
 ) -> Tuning:
-    """Return what the rows of all other seeds teach, judged on `held_out_seeds`.
+    """Fit to the rows of all other seeds, evaluate on `held_out_seeds`, and return the result.
 
     Args:
         logs: of `./z1 bench`; the held-out seeds may be among them.
-        held_out_seeds: by which proposals are judged.
+        held_out_seeds: for the evaluation of proposals.
         reading: in which successes are counted.
-        folder: for the proposals that no logged method stands for, as scoring files.
-        run: runs what is missing on the held-out seeds; None leaves such proposals unjudged.
+        folder: for the proposals that equal no logged method, as scoring files.
+        run: runs the missing episodes on the held-out seeds; None leaves such proposals without results.
         head: whether a scoring head is proposed.
 
     Raises:
@@ -78,22 +78,27 @@ def tune(
     train = [row for row in logs.rows if row["seed"] not in held_out_seeds]
     if not train:
         raise TuneError(
-            f"all seeds of the episodes ({', '.join(map(str, logs.seeds))}) are held out; name fewer, or log more."
+            f"tune: all seeds of the episodes are held out ({', '.join(map(str, logs.seeds))}). Hold out fewer, or log "
+            "more.",
+            code="all_held_out",
         )
-    samples = samples_of(train, reading)
+    samples = extract_samples(train, reading)
     report = fit_head(samples) if head else None
-    proposed = report.head if report is not None and report.helps else None
+    proposed = report.head if report is not None and report.beats_base_rate else None
     drafts = {
         name: draft(name, train, logs.config, reading=reading, head=proposed, folder=folder)
         for name in FAMILIES
         if any(row["method"] == name for row in train)
     }
     if not drafts:
-        raise TuneError(f"no episodes of {' or '.join(FAMILIES)} with the hand-set values are among the rows.")
-    held = _held_out_rows(drafts, train, logs, held_out_seeds, run)
-    families = {name: _judged(name, drafted, held, reading) for name, drafted in drafts.items()}
+        raise TuneError(
+            f"tune: the rows have no episodes of {' or '.join(FAMILIES)} with the hand-set values. Log one of them.",
+            code="no_baseline",
+        )
+    held = _collect_held_out(drafts, train, logs, held_out_seeds, run)
+    families = {name: _evaluate(name, drafted, held, reading) for name, drafted in drafts.items()}
     train_seeds = tuple(sorted({row["seed"] for row in train}))
-    kept = {name: hand_ranking(name, logs.config) for name in FAMILIES}
+    kept = {name: baseline_ranking(name, logs.config) for name in FAMILIES}
     kept |= {name: family.kept for name, family in families.items()}
     return Tuning(
         reading=reading,
@@ -101,7 +106,7 @@ def tune(
         held_out_seeds=tuple(held_out_seeds),
         families=families,
         head=report,
-        head_note=_head_note(head, report, samples.worked),
+        head_note=_head_note(head, report, samples.success),
         scoring=Scoring(
             mvb=kept["mvb"],
             full=kept["full"],
@@ -111,10 +116,10 @@ def tune(
     )
 
 
-def _held_out_rows(
+def _collect_held_out(
     drafts: Mapping[str, Draft], train: Sequence[Row], logs: Logs, seeds: Sequence[int], run: RunEpisodes | None
 ) -> list[Row]:
-    """Return the rows of the held-out seeds, those that had to be run for it among them."""
+    """Return the rows of the held-out seeds, with those run for it."""
     held = [row for row in logs.rows if row["seed"] in seeds]
     names = [
         text
@@ -124,39 +129,43 @@ def _held_out_rows(
     ]
     if run is None or not names:
         return held
-    poses = {pose_of(row): row for row in train}
+    poses = {scenario_pose(row): row for row in train}
     try:
-        scenarios = [replace(Scenario.of(row), seed=seed) for seed in seeds for row in poses.values()]
+        scenarios = [replace(Scenario.from_row(row), seed=seed) for seed in seeds for row in poses.values()]
     except ValueError as error:
         raise TuneError(
-            f"{error} Episodes with a mesh of yours cannot be run again from their rows: log the held-out seeds too, "
-            "and give --no-run."
+            f"tune: episodes with a mesh of yours cannot be run again from their rows ({error}) Log the held-out seeds "
+            "too, and give --no-run.",
+            code="mesh_episodes",
         ) from error
     done = {(row["scenario"], row["method"]) for row in held}
     return [*held, *run([parse_method(text) for text in names], scenarios, done)]
 
 
-def _judged(name: str, drafted: Draft, held: Sequence[Row], reading: Reading) -> Family:
-    proposals = judge(held, name, drafted.proposals, reading)
-    best = best_of(proposals, reading)
+def _evaluate(name: str, drafted: Draft, held: Sequence[Row], reading: Reading) -> Family:
+    proposals = evaluate_proposals(held, name, drafted.proposals, reading)
+    best = select_best(proposals, reading)
     return Family(
         draft=drafted,
         proposals=tuple(proposals),
-        kept=best.ranking if best else drafted.hand,
+        kept=best.ranking if best else drafted.baseline,
         tuned=best is not None,
-        why=verdict(drafted.hand, proposals, best, reading),
+        why=describe_verdict(drafted.baseline, proposals, best, reading),
     )
 
 
-def _head_note(wanted: bool, report: HeadReport | None, worked: np.ndarray) -> str:
-    seen = f"{len(worked)} different grasps with features, {int(worked.sum())} of which worked"
+def _head_note(wanted: bool, report: HeadReport | None, success: np.ndarray) -> str:
+    grasps = f"{len(success)} different grasps with features, {int(success.sum())} of them successful"
     if not wanted:
-        return "No head was asked for."
+        return "No head was requested."
     if report is None:
         return (
-            f"No head was fitted: the rows hold {seen}; it takes 10 of either kind. Rows of an older version hold none."
+            f"No head was fitted: the rows have {grasps}; 10 of either kind are needed. Rows of older versions have "
+            "none."
         )
-    return f"Fitted to {seen}." + ("" if report.helps else " It says no more than their share, so it is not proposed.")
+    return f"Fitted to {grasps}." + (
+        "" if report.beats_base_rate else " It predicts no better than the success rate, so it is not proposed."
+    )
 
 
 def _evidence(
@@ -173,11 +182,11 @@ def _evidence(
         "detector": logs.config.detector,
         "reading": reading,
         "fitted_to_seeds": list(train_seeds),
-        "judged_on_seeds": list(held_out_seeds),
+        "evaluated_on_seeds": list(held_out_seeds),
         "verdicts": {name: family.why for name, family in families.items()},
-        "judged": {
+        "evaluated": {
             name: [
-                {"method": proposal.method, **{key: tally.plain() for key, tally in proposal.tallies.items()}}
+                {"method": proposal.method, **{key: result.to_dict() for key, result in proposal.results.items()}}
                 for proposal in family.proposals
             ]
             for name, family in families.items()

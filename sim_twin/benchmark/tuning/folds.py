@@ -1,4 +1,4 @@
-"""How scenarios are cut for cross-validation, and the word for who lacks scikit-learn."""
+"""Folds of the scenarios for cross-validation, and the check for scikit-learn."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ def require_sklearn() -> None:
     """Raise unless scikit-learn can be imported.
 
     Raises:
-        NoSklearnError: it cannot.
+        NoSklearnError: it is not installed.
     """
     try:
         import sklearn  # noqa: F401
     except ImportError as error:
         raise NoSklearnError(
-            "tuning needs scikit-learn, which is an extra: uv sync --inexact --extra tune, then run this again."
+            "tune: scikit-learn is not installed (extra `tune`). Run uv sync --inexact --extra tune, then this again."
         ) from error
 
 
-def folds_of(groups: Sequence[str] | np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yield indices to fit on and to judge on, 5 times or once for each group if there are fewer.
+def make_folds(groups: Sequence[str] | np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield indices to fit on and to evaluate on, 5 times or once for each group if there are fewer.
 
-    No group stands on both sides: the same pose under two seeds is nearly the same scenario. Two at least are needed;
-    with one nothing is yielded.
+    No group is on both sides: the same pose under two seeds is nearly the same scenario. One group alone yields
+    nothing.
     """
     from sklearn.model_selection import GroupKFold
 

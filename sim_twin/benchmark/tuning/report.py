@@ -1,166 +1,150 @@
-"""The tuning's figures for people: one self-contained page of HTML."""
+"""report.html of a tuning run: variants, thresholds, held-out results and the scoring head on one page."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from html import escape
 from pathlib import Path
+from typing import Any
 
-from sim_twin.benchmark.report import svg
-from sim_twin.benchmark.report.report_tables import table
+from sim_twin.benchmark.report.page import write_page
+from sim_twin.benchmark.report.plots import Point, method_keys, plot_rate_curves
+from sim_twin.benchmark.report.tables import Table
 from sim_twin.benchmark.tuning.fit import Family, Tuning
 from sim_twin.benchmark.tuning.head import HeadReport, Skill
-from sim_twin.benchmark.tuning.svg import Point, rate_curves
 from sim_twin.benchmark.tuning.thresholds import Threshold
-from sim_twin.benchmark.tuning.variants import said
+from sim_twin.benchmark.tuning.variants import format_ranking
 from z1_runtime.grasping.features import FEATURES
-
-_STYLE = """:root{color-scheme:light}body{font:15px/1.55 system-ui,sans-serif;max-width:64rem;margin:0 auto;
-padding:2rem 1.5rem 4rem;color:#1a202c;background:#fff}h2{margin:2.6rem 0 .8rem;border-bottom:2px solid #e2e8f0}
-figcaption,small{color:#4a5568;font-size:.86rem}figure{margin:.5rem 0}.row{display:flex;flex-wrap:wrap;gap:.5rem 2.5rem}
-svg{max-width:100%;height:auto;font-family:inherit}.wide{overflow-x:auto}table{border-collapse:collapse}
-td,th{padding:.28rem 1.1rem .28rem 0;text-align:left;border-bottom:1px solid #e2e8f0;white-space:nowrap}
-.legend span{margin-right:1.2rem}.legend i{display:inline-block;width:.8em;height:.8em;margin-right:.35em}
-.verdict{border-left:5px solid #b7791f;background:#f7fafc;padding:.6rem 1rem;margin:.8rem 0}
-.won{border-color:#2f855a}"""
 
 
 def write_tuning_report(tuning: Tuning, path: Path) -> None:
-    """Write the report of `tuning`; the file is there only when it is whole."""
-    parts = [
-        "<h1>Offline calibration of the ranking</h1>",
-        f"<p>Fitted to seeds {_list(tuning.train_seeds)}, judged on seeds {_list(tuning.held_out_seeds)}, by the "
-        f"reading {tuning.reading}.</p>",
-        *(_verdict(name, family) for name, family in tuning.families.items()),
-        *(_family(name, family, tuning.reading) for name, family in tuning.families.items()),
-        "<h2>Scoring head</h2>",
-        f"<p>{escape(tuning.head_note)}</p>",
-        _head(tuning.head) if tuning.head else "",
-    ]
-    head = (
-        "<!doctype html><html lang='en'><meta charset='utf-8'><meta name='viewport' content='width=device-width'>"
-        f"<title>Offline calibration</title><style>{_STYLE}</style>"
+    """Write the report of `tuning`; the file appears once it is complete."""
+    write_page(
+        path,
+        "tuning.html.j2",
+        title="Offline calibration of the ranking",
+        scope=f"Fitted to seeds {_list(tuning.train_seeds)}, evaluated on seeds {_list(tuning.held_out_seeds)}, by the "
+        f"reading {tuning.reading}.",
+        families=[_describe_family(name, family, tuning.reading) for name, family in tuning.families.items()],
+        head_note=tuning.head_note,
+        head=_describe_head(tuning.head) if tuning.head else None,
     )
-    partial = path.with_suffix(".partial")
-    partial.write_text(head + "\n".join(parts) + "</html>\n", encoding="utf-8")
-    partial.replace(path)
 
 
-def held_out_lines(family: Family) -> list[list[str]]:
-    """Return a line for each proposal and reading: what, reading, successes, the hand-set values', p, and whether it
-    won."""
-    return [
-        [
-            said(proposal.ranking),
-            reading,
-            f"{tally.tuned} of {tally.scenarios}",
-            f"{tally.hand} of {tally.scenarios}",
-            f"{tally.test.p:.2g}",
-            "taken" if proposal.ranking == family.kept else "won" if proposal.wins else "not kept",
-        ]
-        for proposal in family.proposals
-        for reading, tally in proposal.tallies.items()
-    ]
-
-
-HELD_OUT_HEAD = ("proposal", "reading", "successes", "set by hand", "McNemar p", "")
-
-
-def threshold_line(key: str, threshold: Threshold | None) -> list[str]:
-    """Return a cut in words: which, where, success below and above it out of its own fold, p, and what it led to."""
-    if threshold is None:
-        return [key, "–", "–", "–", "–", "no cut with more failures below it"]
-    (low, n_low), (high, n_high) = threshold.below, threshold.above
-    verdict = "proposed" if threshold.holds else "does not hold out of its own fold"
-    return [key, f"{threshold.value:.4g}", f"{low} of {n_low}", f"{high} of {n_high}", f"{threshold.p:.2g}", verdict]
-
-
-THRESHOLD_HEAD = ("threshold", "value", "worked below", "worked above", "Fisher p", "")
-
-
-def skill_line(name: str, skill: Skill) -> list[str]:
-    """Return what a head knows of grasps that it was not fitted to."""
-    return [
-        name,
-        f"{skill.worked} of {skill.grasps}",
-        f"{skill.auc:.3f}",
-        f"{skill.log_loss:.3f}",
-        f"{skill.log_loss_of_rate:.3f}",
-        f"{skill.brier:.3f}",
-    ]
-
-
-SKILL_HEAD = ("judged on", "worked", "AUC", "log loss", "log loss of the mere share", "Brier")
-
-
-def _list(numbers: Sequence[int]) -> str:
-    return ", ".join(map(str, numbers))
-
-
-def _verdict(name: str, family: Family) -> str:
-    won = " won" if family.tuned else ""
-    return f"<p class='verdict{won}'><b>{name}</b>: {escape(family.why)}</p>"
-
-
-def _family(name: str, family: Family, reading: str) -> str:
+def tabulate_variants(name: str, family: Family, reading: str) -> Table:
+    """Return successes of each variant on the seeds fitted to."""
     draft, variants = family.draft, family.draft.variants
-    lines = [
+    rows = [
         [
             text,
-            said(draft.rankings[text]),
+            format_ranking(draft.rankings[text]),
             *(f"{own[text]} of {variants.scenarios}" for own in variants.successes.values()),
         ]
         for text in variants.names
     ]
     folds = ", ".join(dict.fromkeys(variants.by_fold)) or "none"
-    held = held_out_lines(family)
-    return "\n".join(
-        [
-            f"<h2>{name}</h2>",
-            _curves(family, reading),
-            table(["variant", "numbers", *variants.successes], lines),
-            f"<p><small>On the seeds fitted to. Best: {escape(variants.chosen)}; best of a part of the scenarios: "
-            f"{escape(folds)}. Choosing so and judging on the other scenarios gives {variants.cross_validated} of "
-            f"{variants.scenarios} ({reading}), the hand-set values {variants.successes[reading][name]}.</small></p>",
-            table(THRESHOLD_HEAD, [threshold_line(key, cut) for key, cut in draft.thresholds.items()]),
-            table(HELD_OUT_HEAD, held) if held else "<p>Nothing was judged on held-out seeds.</p>",
-        ]
+    note = (
+        f"On the seeds fitted to. Best: {variants.chosen}; best of a part of the scenarios: {folds}. Cross-validated, "
+        f"this choice gives {variants.cross_validated} of {variants.scenarios} ({reading}), the hand-set values "
+        f"{variants.successes[reading][name]}."
     )
+    return Table(["variant", "numbers", *variants.successes], rows, note)
 
 
-def _curves(family: Family, reading: str) -> str:
-    """Return success against α, a line for each k and box; of variants that differ in nothing else."""
+def tabulate_held_out(family: Family) -> Table:
+    """Return the proposals' successes on the held-out seeds, by reading, next to the hand-set values'."""
+    rows = [
+        [
+            format_ranking(proposal.ranking),
+            reading,
+            f"{result.tuned} of {result.scenarios}",
+            f"{result.baseline} of {result.scenarios}",
+            f"{result.test.p:.2g}",
+            "taken" if proposal.ranking == family.kept else "won" if proposal.wins else "not kept",
+        ]
+        for proposal in family.proposals
+        for reading, result in proposal.results.items()
+    ]
+    return Table(["proposal", "reading", "successes", "set by hand", "McNemar p", ""], rows)
+
+
+def tabulate_thresholds(thresholds: Mapping[str, Threshold | None]) -> Table:
+    """Return each threshold with the successes below and above it outside of its own fold."""
+    rows = [_threshold_row(name, threshold) for name, threshold in thresholds.items()]
+    return Table(["threshold", "value", "successes below", "successes above", "Fisher p", ""], rows)
+
+
+def _threshold_row(name: str, threshold: Threshold | None) -> list[str]:
+    if threshold is None:
+        return [name, "–", "–", "–", "–", "no value with more failures below it"]
+    (low, n_low), (high, n_high) = threshold.below, threshold.above
+    conclusion = "proposed" if threshold.is_significant else "not significant outside of its own fold"
+    counts = [f"{low} of {n_low}", f"{high} of {n_high}"]
+    return [name, f"{threshold.value:.4g}", *counts, f"{threshold.p:.2g}", conclusion]
+
+
+def tabulate_skill(report: HeadReport) -> Table:
+    """Return the head's metrics on grasps that it was not fitted to."""
+    rows = [_skill_row("other scenarios", report.skill)]
+    rows += [_skill_row(f"{name}, fitted to the others", skill) for name, skill in report.objects.items()]
+    return Table(["evaluated on", "successes", "AUC", "log loss", "log loss of the success rate alone", "Brier"], rows)
+
+
+def _skill_row(name: str, skill: Skill) -> list[str]:
+    metrics = (skill.auc, skill.log_loss, skill.log_loss_of_base_rate, skill.brier)
+    return [name, f"{skill.successes} of {skill.grasps}", *(f"{metric:.3f}" for metric in metrics)]
+
+
+def _describe_family(name: str, family: Family, reading: str) -> dict[str, Any]:
+    curves = _curves(family, reading)
+    caption = f"Success ({reading}) on the seeds fitted to, against α; lines are 95 % intervals."
+    return {
+        "name": name,
+        "tuned": family.tuned,
+        "verdict": family.why,
+        "legend": method_keys(list(curves)),
+        "plot": plot_rate_curves(curves, "α", caption),
+        "variants": tabulate_variants(name, family, reading),
+        "thresholds": tabulate_thresholds(family.draft.thresholds),
+        "held_out": tabulate_held_out(family),
+    }
+
+
+def _curves(family: Family, reading: str) -> dict[str, list[Point]]:
+    """Return success against α for each k and box; of variants that differ in nothing else."""
     draft = family.draft
     series: dict[str, list[Point]] = {}
     for text in draft.variants.names:
         ranking = draft.rankings[text]
         if ranking.head is None and (ranking.min_alignment, ranking.min_score) == (
-            draft.hand.min_alignment,
-            draft.hand.min_score,
+            draft.baseline.min_alignment,
+            draft.baseline.min_score,
         ):
             rest = "" if ranking.hard_filter else ", no hard filter"
             name = f"k = {ranking.k_faces}, {ranking.box_method}{rest}"
-            tally = draft.variants.successes[reading][text], draft.variants.scenarios
-            series.setdefault(name, []).append((ranking.alpha, *tally))
-    series = {name: sorted(points) for name, points in sorted(series.items())}
-    caption = f"Success ({reading}) on the seeds fitted to, against α; lines are 95 % intervals."
-    return svg.legend(list(series)) + rate_curves(series, "α", caption)
+            counts = draft.variants.successes[reading][text], draft.variants.scenarios
+            series.setdefault(name, []).append((ranking.alpha, *counts))
+    return {name: sorted(points) for name, points in sorted(series.items())}
 
 
-def _head(report: HeadReport) -> str:
+def _describe_head(report: HeadReport) -> dict[str, Any]:
     head = report.head
     weights: Mapping[str, float] = dict(zip(head.features, head.coefficients, strict=True))
-    lines = [
-        [name, meaning, f"{weights[name]:+.2f}" if name in weights else "does not vary", f"{report.alone[name]:.3f}"]
+    rows = [
+        [
+            name,
+            meaning,
+            f"{weights[name]:+.2f}" if name in weights else "constant",
+            f"{report.single_feature_auc[name]:.3f}",
+        ]
         for name, meaning in FEATURES.items()
     ]
-    caption = "Share that worked against the probability told, of grasps in scenarios that were not fitted to."
-    skills = [skill_line("other scenarios", report.skill)]
-    skills += [skill_line(f"{name}, fitted to the others", skill) for name, skill in report.objects.items()]
-    return "\n".join(
-        [
-            table(SKILL_HEAD, skills),
-            rate_curves({"head": list(report.bins)}, "probability told", caption, diagonal=True),
-            table(["feature", "meaning", "weight of one deviation", "AUC alone"], lines),
-        ]
-    )
+    caption = "Success rate against the predicted probability, of grasps in scenarios that were not fitted to."
+    return {
+        "skill": tabulate_skill(report),
+        "plot": plot_rate_curves({"head": list(report.bins)}, "predicted probability", caption, diagonal=True),
+        "features": Table(["feature", "meaning", "weight per standard deviation", "AUC alone"], rows),
+    }
+
+
+def _list(numbers: Sequence[int]) -> str:
+    return ", ".join(map(str, numbers))

@@ -1,4 +1,4 @@
-"""Looks for a value below which grasps fail: one cut of one number, believed only if it holds out of its own fold."""
+"""Fit of a threshold below which grasps fail: one split of one number, tested outside of its own fold."""
 
 from __future__ import annotations
 
@@ -7,66 +7,67 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import fisher_exact
 
-from sim_twin.benchmark.tuning.folds import folds_of
+from sim_twin.benchmark.tuning.folds import make_folds
 
-LEAST = 5
-"""Fewest grasps below a cut."""
-P_MOST = 0.05
+MIN_GRASPS_PER_SIDE = 5
+"""Minimum number of grasps on either side of a split."""
+MAX_P = 0.05
+"""Significance level of Fisher's test, the usual one."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Threshold:
-    """A cut and what speaks for it."""
+    """A split and its evidence."""
 
     value: float
     """Grasps below it failed more often."""
     below: tuple[int, int]
-    """Successes and grasps below the cuts of the folds that they had no part in."""
+    """Successes and grasps below the splits of the folds that do not contain them."""
     above: tuple[int, int]
     """The same at or above them."""
     p: float
-    """Fisher's exact test, one-sided, of those."""
+    """Fisher's exact test, one-sided, of these counts."""
 
     @property
-    def holds(self) -> bool:
-        """Return whether it is believed."""
-        return self.p < P_MOST
+    def is_significant(self) -> bool:
+        """Return whether the failures below it are more than chance."""
+        return self.p < MAX_P
 
 
-def fit_threshold(values: np.ndarray, worked: np.ndarray, poses: np.ndarray) -> Threshold | None:
-    """Return the cut that parts failures best from successes; None where none leaves `LEAST` grasps on both sides.
+def fit_threshold(values: np.ndarray, success: np.ndarray, poses: np.ndarray) -> Threshold | None:
+    """Return the split of failures from successes with the greatest likelihood; None where no side is large enough.
 
     Args:
         values: (N,) of each grasp; NaN ones are left out.
-        worked: (N,) bool.
-        poses: (N,) the scenarios without their seeds, by which it is cross-validated.
+        success: (N,) bool.
+        poses: (N,) the scenarios without their seeds, the groups of the cross-validation.
     """
     known = np.isfinite(values)
-    values, worked, poses = values[known], worked[known], poses[known]
-    value = _best_cut(values, worked)
+    values, success, poses = values[known], success[known], poses[known]
+    value = _best_split(values, success)
     if value is None:
         return None
-    tally = np.zeros((2, 2), dtype=int)  # below, above; failed, worked
-    for train, test in folds_of(poses):
-        cut = _best_cut(values[train], worked[train])
-        if cut is not None:
-            np.add.at(tally, ((values[test] >= cut).astype(int), worked[test].astype(int)), 1)
+    counts = np.zeros((2, 2), dtype=int)  # below, above; failures, successes
+    for train, test in make_folds(poses):
+        split = _best_split(values[train], success[train])
+        if split is not None:
+            np.add.at(counts, ((values[test] >= split).astype(int), success[test].astype(int)), 1)
     return Threshold(
         value=value,
-        below=(int(tally[0, 1]), int(tally[0].sum())),
-        above=(int(tally[1, 1]), int(tally[1].sum())),
-        p=float(fisher_exact(tally, alternative="greater")[1]),  # pyright: ignore[reportArgumentType]
+        below=(int(counts[0, 1]), int(counts[0].sum())),
+        above=(int(counts[1, 1]), int(counts[1].sum())),
+        p=float(fisher_exact(counts, alternative="greater")[1]),  # pyright: ignore[reportArgumentType]
     )
 
 
-def _best_cut(values: np.ndarray, worked: np.ndarray) -> float | None:
+def _best_split(values: np.ndarray, success: np.ndarray) -> float | None:
     """Return the midpoint between two values that gives the labels the greatest likelihood, failures below."""
     order = np.argsort(values, kind="stable")
-    values, labels = values[order], worked[order].astype(float)
+    values, labels = values[order], success[order].astype(float)
     n, right = len(values), float(labels.sum())
     below = np.arange(1, n)
     right_below = np.cumsum(labels)[:-1]
-    allowed = (below >= LEAST) & (n - below >= LEAST) & (np.diff(values) > 1e-9)
+    allowed = (below >= MIN_GRASPS_PER_SIDE) & (n - below >= MIN_GRASPS_PER_SIDE) & (np.diff(values) > 1e-9)
     allowed &= right_below / below < (right - right_below) / np.maximum(n - below, 1)
     if not allowed.any():
         return None

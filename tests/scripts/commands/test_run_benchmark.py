@@ -4,11 +4,14 @@ import pyarrow.parquet as pq
 import pytest
 import trimesh
 
+from hal.base.errors import InvalidValueError, OutputExistsError
 from scripts.commands import run_benchmark
 from scripts.commands.run_benchmark import Config, main
 from sim_twin.benchmark.episodes import runner, scenarios
+from sim_twin.benchmark.episodes.execution import EpisodeRobot, Mode, Outcome
 from sim_twin.benchmark.episodes.runner import run_task
-from sim_twin.benchmark.episodes.trial import Mode, Outcome, Robot
+from tests.support.errors import raises
+from tests.support.failing_method import InjectedError
 
 
 @pytest.fixture
@@ -17,7 +20,7 @@ def short(monkeypatch, tmp_path):
     whole = scenarios.grid
     monkeypatch.setattr(scenarios, "grid", lambda *args, **kwargs: whole(*args, **kwargs)[10:11])
     monkeypatch.setattr(runner, "run_tasks", lambda tasks, jobs: map(run_task, tasks))
-    monkeypatch.setattr(Robot, "act", lambda *_: Outcome(mode=Mode.MISSED))
+    monkeypatch.setattr(EpisodeRobot, "execute", lambda *_: Outcome(mode=Mode.MISSED))
     monkeypatch.setattr("sim_twin.benchmark.report.pictures._SIZE", (320, 180))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
 
@@ -37,26 +40,42 @@ def test_a_run_of_a_users_mesh_writes_all_that_it_says(short, tmp_path, capsys):
     (recording,) = (out / "recordings").iterdir()
     assert picture.stem == recording.stem == f"{row['scenario']}-mvb"
     page = (out / "report.html").read_text()
-    assert f"href='recordings/{row['scenario'].replace('+', '%2B')}-mvb.rrd'" in page
+    assert f'href="recordings/{row["scenario"].replace("+", "%2B")}-mvb.rrd"' in page
     assert "within 2" in capsys.readouterr().out
 
-    with pytest.raises(FileExistsError, match="--resume"):
+    with raises(OutputExistsError, "output_exists"):
         main(config)
     before = recording.stat().st_mtime_ns
     assert main(Config(**{**vars(config), "resume": True})) == 0
     assert recording.stat().st_mtime_ns == before
 
 
+def test_an_exception_in_an_episode_is_counted_and_sets_the_exit_code(short, tmp_path, monkeypatch, capsys):
+    def execute(*_):
+        raise InjectedError("the gripper is beyond its limit")
+
+    monkeypatch.setattr(EpisodeRobot, "execute", execute)
+    out = tmp_path / "out"
+    config = Config(objects=("cylinder",), methods=("mvb",), jobs=1, out=out)
+    assert main(config) == 1
+    (row,) = pq.read_table(out / "episodes.parquet").to_pylist()
+    assert (row["mode"], row["detail"]) == ("error", "the gripper is beyond its limit")
+    assert json.loads((out / "summary.json").read_text())["methods"]["mvb"]["errors"] == 1
+    assert "InjectedError" in (out / "errors.log").read_text()
+    assert "1 episodes ended in an exception" in capsys.readouterr().out
+    assert main(Config(**{**vars(config), "resume": True})) == 1
+
+
 @pytest.mark.parametrize(
-    ("options", "words"),
+    ("options", "code"),
     [
-        ({"jobs": 0}, "jobs is 0"),
-        ({"top_k": 0}, "top-k is 0; allowed is 1 to 10"),
-        ({"ray": "auto", "recordings": "all"}, "cluster's machines"),
+        ({"jobs": 0}, "jobs_range"),
+        ({"top_k": 0}, "top_k_range"),
+        ({"ray": "auto", "recordings": "all"}, "recordings_on_cluster"),
     ],
 )
-def test_options_that_cannot_be_are_refused(options, words):
-    with pytest.raises(ValueError, match=words):
+def test_invalid_options_are_rejected(options, code):
+    with raises(InvalidValueError, code):
         Config(**options)
 
 

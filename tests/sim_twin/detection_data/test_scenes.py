@@ -10,19 +10,19 @@ import pytest
 from hal.base import z1
 from sim_twin.camera.d405 import INTRINSICS
 from sim_twin.camera.render import make_renderer
-from sim_twin.detection_data.photometric_noise import spoil_photo
-from sim_twin.detection_data.props import CLASSES, HIDDEN_GROUP, make_class_prop, make_distractor, nominal_prop
-from sim_twin.detection_data.scene_renderer import Stage
+from sim_twin.detection_data.photometric_noise import augment_image
+from sim_twin.detection_data.props import CLASSES, UNDRAWN_GROUP, make_class_prop, make_distractor, nominal_prop
+from sim_twin.detection_data.scene_renderer import SceneRenderer
 from sim_twin.detection_data.scenes import (
-    LEAST_MARK_SHARE,
-    LEAST_PIXELS,
-    LEAST_SHARE,
+    MIN_MARK_RATIO,
+    MIN_PIXELS,
+    MIN_VISIBLE_RATIO,
     Appearance,
     SceneMix,
     draw_scenario,
     draw_scene,
-    outline,
-    seen_share,
+    project_outline,
+    visible_ratio,
 )
 from sim_twin.detection_data.textures import random_texture
 from sim_twin.model.objects import OBJECTS
@@ -34,15 +34,15 @@ HOME = np.append(z1.Q_HOME, -1.0)
 
 
 @pytest.fixture(scope="module")
-def stage() -> Iterator[Stage]:
-    made = Stage(7)
+def renderer() -> Iterator[SceneRenderer]:
+    made = SceneRenderer(7)
     yield made
     made.close()
 
 
 @needs_egl
-def test_the_same_seed_gives_the_same_picture_and_another_seed_another(stage: Stage) -> None:
-    first, again, other = (draw_scene(stage, np.random.default_rng(seed)) for seed in (3, 3, 4))
+def test_the_same_seed_gives_the_same_picture_and_another_seed_another(renderer: SceneRenderer) -> None:
+    first, again, other = (draw_scene(renderer, np.random.default_rng(seed)) for seed in (3, 3, 4))
     assert np.array_equal(first.colour, again.colour)
     assert [label.name for label in first.labels] == [label.name for label in again.labels]
     assert all(np.array_equal(a.mask, b.mask) for a, b in zip(first.labels, again.labels, strict=True))
@@ -50,14 +50,14 @@ def test_the_same_seed_gives_the_same_picture_and_another_seed_another(stage: St
 
 
 @needs_egl
-def test_labels_are_of_the_three_classes_large_enough_and_apart(stage: Stage) -> None:
+def test_labels_are_of_the_three_classes_large_enough_and_apart(renderer: SceneRenderer) -> None:
     seen = 0
     for seed in range(12):
-        picture = draw_scene(stage, np.random.default_rng(seed), SceneMix(empty=0.0))
+        picture = draw_scene(renderer, np.random.default_rng(seed), SceneMix(empty=0.0))
         assert picture.colour.shape == (INTRINSICS.height, INTRINSICS.width, 3)
         for label in picture.labels:
             assert label.name in CLASSES
-            assert label.mask.sum() >= LEAST_PIXELS
+            assert label.mask.sum() >= MIN_PIXELS
             left, top, right, bottom = label.box()
             outside = label.mask.copy()
             outside[top:bottom, left:right] = False
@@ -71,17 +71,17 @@ def test_labels_are_of_the_three_classes_large_enough_and_apart(stage: Stage) ->
 
 
 @needs_egl
-def test_an_empty_scene_has_no_labels(stage: Stage) -> None:
+def test_an_empty_scene_has_no_labels(renderer: SceneRenderer) -> None:
     for seed in range(4):
-        assert draw_scene(stage, np.random.default_rng(seed), SceneMix(empty=1.0)).labels == ()
+        assert draw_scene(renderer, np.random.default_rng(seed), SceneMix(empty=1.0)).labels == ()
 
 
 @needs_egl
 @pytest.mark.parametrize("name", CLASSES)
-def test_a_scenario_has_the_mask_that_the_twin_has(stage: Stage, name: str) -> None:
+def test_a_scenario_has_the_mask_that_the_twin_has(renderer: SceneRenderer, name: str) -> None:
     config = SceneConfig(object=name, distance_m=0.48, lateral_m=-0.15, pitch_deg=45.0)
     pose = config.T_base_object()
-    picture = draw_scenario(stage, name, pose, np.random.default_rng(0), look="any")
+    picture = draw_scenario(renderer, name, pose, np.random.default_rng(0), appearance="any")
     world = World(config)
     data = world.snapshot()
     quat = np.empty(4)
@@ -96,69 +96,74 @@ def test_a_scenario_has_the_mask_that_the_twin_has(stage: Stage, name: str) -> N
 
 
 @needs_egl
-@pytest.mark.parametrize("look", get_args(Appearance))
-def test_an_object_has_its_own_colours_unless_any_will_do(stage: Stage, look: Appearance) -> None:
-    actor, pose = stage.named("cylinder")[0], SceneConfig(object="cylinder").T_base_object()
-    own = [part.rgba for part, _ in actor.prop.parts]
+@pytest.mark.parametrize("appearance", get_args(Appearance))
+def test_an_object_has_its_own_colours_unless_any_will_do(renderer: SceneRenderer, appearance: Appearance) -> None:
+    instance, pose = renderer.named("cylinder")[0], SceneConfig(object="cylinder").T_base_object()
+    own = [part.rgba for part, _ in instance.prop.parts]
     alike = []
     for seed in range(5):
-        assert draw_scenario(stage, "cylinder", pose, np.random.default_rng(seed), look=look).look == look
-        untextured = (stage.model.geom_matid[actor.geoms] < 0).all()
-        alike.append(untextured and np.allclose(stage.model.geom_rgba[actor.geoms], own))
-    assert any(alike) == all(alike) == (look != "any")
+        assert (
+            draw_scenario(renderer, "cylinder", pose, np.random.default_rng(seed), appearance=appearance).appearance
+            == appearance
+        )
+        untextured = (renderer.model.geom_matid[instance.geoms] < 0).all()
+        alike.append(untextured and np.allclose(renderer.model.geom_rgba[instance.geoms], own))
+    assert any(alike) == all(alike) == (appearance != "any")
 
 
 @needs_egl
-def test_what_an_occluder_covers_belongs_to_no_label_and_what_hardly_shows_is_taken_away(stage: Stage) -> None:
-    T_base_camera = stage.set_arm(HOME)
-    cylinder, card = stage.named("cylinder")[0], stage.distractors()[0]
+def test_what_an_occluder_covers_belongs_to_no_label_and_what_hardly_shows_is_taken_away(
+    renderer: SceneRenderer,
+) -> None:
+    T_base_camera = renderer.set_arm(HOME)
+    cylinder, card = renderer.named("cylinder")[0], renderer.distractors()[0]
     pose = SceneConfig(object="cylinder").T_base_object()
-    stage.clear()
-    stage.put(cylinder, pose)
-    alone = stage.draw_instances("wrist", "pieces") == stage.actors.index(cylinder)
+    renderer.clear()
+    renderer.put(cylinder, pose)
+    alone = renderer.draw_instances("wrist", "pieces") == renderer.props.index(cylinder)
     between = np.eye(4)
     between[:3, 3] = 0.6 * pose[:3, 3] + 0.4 * T_base_camera[:3, 3]
-    stage.put(card, between)
-    instances = stage.draw_instances("wrist", "pieces")
-    behind = instances == stage.actors.index(cylinder)
+    renderer.put(card, between)
+    instances = renderer.draw_instances("wrist", "pieces")
+    behind = instances == renderer.props.index(cylinder)
     assert behind.sum() < alone.sum()
     assert not (behind & ~alone).any()
-    assert (instances == stage.actors.index(card)).any()
-    stage.hide(cylinder)
-    assert not (stage.draw_instances("wrist", "pieces") == stage.actors.index(cylinder)).any()
+    assert (instances == renderer.props.index(card)).any()
+    renderer.hide(cylinder)
+    assert not (renderer.draw_instances("wrist", "pieces") == renderer.props.index(cylinder)).any()
 
 
 @needs_egl
-def test_every_label_shows_enough_of_its_outline(stage: Stage) -> None:
+def test_every_label_shows_enough_of_its_outline(renderer: SceneRenderer) -> None:
     for seed in range(20, 32):
-        picture = draw_scene(stage, np.random.default_rng(seed), SceneMix(empty=0.0, wrist=0.0, occluded=1.0))
-        camera = stage.T_base_camera("free")
+        picture = draw_scene(renderer, np.random.default_rng(seed), SceneMix(empty=0.0, wrist=0.0, occluded=1.0))
+        camera = renderer.T_base_camera("free")
         for label in picture.labels:
             areas = []
-            for actor in stage.named(label.name):
-                pose = stage.pose(actor)
-                corners = [points @ pose[:3, :3].T + pose[:3, 3] for points in actor.prop.corners()]
-                whole = outline(corners, camera, stage.intrinsics)
+            for instance in renderer.named(label.name):
+                pose = renderer.pose(instance)
+                corners = [points @ pose[:3, :3].T + pose[:3, 3] for points in instance.prop.corners()]
+                whole = project_outline(corners, camera, renderer.intrinsics)
                 areas.append(np.inf if whole is None else 4 * whole.sum())
-            assert label.mask.sum() >= min(LEAST_SHARE * min(areas), 0.08 * label.mask.size)
+            assert label.mask.sum() >= min(MIN_VISIBLE_RATIO * min(areas), 0.08 * label.mask.size)
 
 
 @needs_egl
-def test_a_bottle_without_its_neck_has_no_label_where_colours_tell_nothing(stage: Stage) -> None:
+def test_a_bottle_without_its_neck_has_no_label_where_colours_tell_nothing(renderer: SceneRenderer) -> None:
     """Its shoulder cut off by the picture's border, a bottle in random colours is a cylinder."""
     seen = {True: 0, False: 0}
     for seed in range(40, 100):
         rng = np.random.default_rng(seed)
-        picture = draw_scene(stage, rng, SceneMix(empty=0.0, twin=0.0, own=0.0, wrist=0.0, occluded=0.0))
-        camera = stage.T_base_camera("free")
-        shown = [a for a in stage.named("bottle") if stage.model.geom_group[a.geoms[0]] != HIDDEN_GROUP]
+        picture = draw_scene(renderer, rng, SceneMix(empty=0.0, twin=0.0, own=0.0, wrist=0.0, occluded=0.0))
+        camera = renderer.T_base_camera("free")
+        shown = [a for a in renderer.named("bottle") if renderer.model.geom_group[a.geoms[0]] != UNDRAWN_GROUP]
         masks = [label.mask for label in picture.labels if label.name == "bottle"]
-        for actor, mask in zip(shown, masks, strict=True) if len(shown) == len(masks) == 1 else []:
-            pose = stage.pose(actor)
-            corners = [points @ pose[:3, :3].T + pose[:3, 3] for points in actor.prop.corners()[-2:]]
-            neck = outline(corners, camera, stage.intrinsics)
+        for instance, mask in zip(shown, masks, strict=True) if len(shown) == len(masks) == 1 else []:
+            pose = renderer.pose(instance)
+            corners = [points @ pose[:3, :3].T + pose[:3, 3] for points in instance.prop.corners()[-2:]]
+            neck = project_outline(corners, camera, renderer.intrinsics)
             assert neck is not None
-            seen[seen_share(mask, neck) >= LEAST_MARK_SHARE] += 1
+            seen[visible_ratio(mask, neck) >= MIN_MARK_RATIO] += 1
     assert seen[True] >= 5
     assert seen[False] == 0
 
@@ -166,16 +171,16 @@ def test_a_bottle_without_its_neck_has_no_label_where_colours_tell_nothing(stage
 def test_the_outline_of_a_plate_square_to_the_camera_is_its_size_in_pixels() -> None:
     plate = np.array([[x, y, 0.5] for x in (-0.05, 0.05) for y in (-0.03, 0.03)])
     wanted = 0.10 * INTRINSICS.fx / 0.5 * 0.06 * INTRINSICS.fy / 0.5
-    whole = outline([plate], np.eye(4), INTRINSICS)
+    whole = project_outline([plate], np.eye(4), INTRINSICS)
     assert whole is not None
     assert 4 * whole.sum() == pytest.approx(wanted, rel=0.06)
     mask = np.zeros((INTRINSICS.height, INTRINSICS.width), dtype=bool)
     mask[:, : round(INTRINSICS.cx)] = True
-    assert seen_share(mask, whole) == pytest.approx(0.5, abs=0.02)
+    assert visible_ratio(mask, whole) == pytest.approx(0.5, abs=0.02)
 
 
 def test_what_comes_too_near_the_lens_has_no_outline() -> None:
-    assert outline([np.array([[0.0, 0.0, 0.03], [0.0, 0.1, 0.3]])], np.eye(4), INTRINSICS) is None
+    assert project_outline([np.array([[0.0, 0.0, 0.03], [0.0, 0.1, 0.3]])], np.eye(4), INTRINSICS) is None
 
 
 def test_props_keep_the_proportions_that_tell_them_from_distractors() -> None:
@@ -212,7 +217,7 @@ def test_a_photograph_is_noisy_in_every_channel_and_brought_to_a_fair_exposure()
     dark = np.full((120, 160, 3), 12, np.uint8)
     noise = []
     for seed in range(20):
-        photo = spoil_photo(dark, np.random.default_rng(seed))
+        photo = augment_image(dark, np.random.default_rng(seed))
         assert photo.shape == dark.shape and photo.dtype == np.uint8
         assert photo.mean() > dark.mean()
         noise.append(photo.std(axis=(0, 1)))
@@ -220,10 +225,10 @@ def test_a_photograph_is_noisy_in_every_channel_and_brought_to_a_fair_exposure()
 
 
 @needs_egl
-def test_a_crowd_shows_more_objects(stage: Stage) -> None:
+def test_a_crowd_shows_more_objects(renderer: SceneRenderer) -> None:
     def shown(crowd: float) -> list[int]:
         mix = SceneMix(empty=0.0, twin=0.0, own=0.0, crowd=crowd)
-        return [len(draw_scene(stage, np.random.default_rng([5, n]), mix).labels) for n in range(8)]
+        return [len(draw_scene(renderer, np.random.default_rng([5, n]), mix).labels) for n in range(8)]
 
     few, many = shown(0.0), shown(1.0)
     assert max(few) <= 3
@@ -232,13 +237,13 @@ def test_a_crowd_shows_more_objects(stage: Stage) -> None:
 
 
 @needs_egl
-def test_more_of_what_is_no_object_stands_about_when_asked(stage: Stage) -> None:
+def test_more_of_what_is_no_object_stands_about_when_asked(renderer: SceneRenderer) -> None:
     def shown(distractors: float) -> int:
         mix = SceneMix(crowd=0.5, occluded=0.0, distractors=distractors)
         counts = []
         for n in range(8):
-            draw_scene(stage, np.random.default_rng([6, n]), mix)
-            counts.append(sum(stage.shows(actor) for actor in stage.distractors()))
+            draw_scene(renderer, np.random.default_rng([6, n]), mix)
+            counts.append(sum(renderer.is_shown(instance) for instance in renderer.distractors()))
         return sum(counts)
 
     none, some, many = shown(0.0), shown(2.0), shown(6.0)
@@ -247,19 +252,19 @@ def test_more_of_what_is_no_object_stands_about_when_asked(stage: Stage) -> None
 
 
 @needs_egl
-def test_every_mug_shows_its_handle(stage: Stage) -> None:
+def test_every_mug_shows_its_handle(renderer: SceneRenderer) -> None:
     """Without it a mug is a cylinder, which a picture must not show without a label."""
     seen = 0
     for seed in range(200, 260):
-        draw_scene(stage, np.random.default_rng(seed), SceneMix(empty=1.0, wrist=0.0))
-        for mug in stage.distractors():
-            if mug.prop.kind != "mug" or not stage.shows(mug):
+        draw_scene(renderer, np.random.default_rng(seed), SceneMix(empty=1.0, wrist=0.0))
+        for mug in renderer.distractors():
+            if mug.prop.kind != "mug" or not renderer.is_shown(mug):
                 continue
-            number = stage.actors.index(mug)
-            whole = stage.draw_instances("free", "none") == number
-            stage.model.geom_group[mug.geoms[2:]] = HIDDEN_GROUP
-            without = stage.draw_instances("free", "none") == number
-            stage.put(mug, stage.pose(mug))
+            number = renderer.props.index(mug)
+            whole = renderer.draw_instances("free", "none") == number
+            renderer.model.geom_group[mug.geoms[2:]] = UNDRAWN_GROUP
+            without = renderer.draw_instances("free", "none") == number
+            renderer.put(mug, renderer.pose(mug))
             assert (whole & ~without).sum() > 0.04 * whole.sum()
             seen += 1
     assert seen >= 3

@@ -5,7 +5,7 @@ from sim_twin.camera.d405 import INTRINSICS
 from sim_twin.camera.render import make_renderer
 from sim_twin.model.more_objects import EXTENDED
 from sim_twin.model.objects import OBJECTS
-from sim_twin.model.parts import turned, wall
+from sim_twin.model.parts import make_homogeneous_lathe, make_wall
 from sim_twin.model.scene import SceneConfig
 from sim_twin.model.world import World
 
@@ -45,20 +45,22 @@ def test_it_is_drawn_where_it_stands(world: World) -> None:
 
 
 def test_it_is_as_high_as_it_says_and_its_origin_at_mid_height(world: World) -> None:
-    thing = OBJECTS[world.config.object]
-    heights = thing.corners()[:, 2]
-    np.testing.assert_allclose([heights.min(), heights.max()], [-thing.height_m / 2, thing.height_m / 2], atol=1e-6)
-    assert 0.05 <= thing.mass_kg <= 0.35
-    assert world.model.body("object").mass[0] == pytest.approx(thing.mass_kg)
+    grasp_object = OBJECTS[world.config.object]
+    heights = grasp_object.corners()[:, 2]
+    np.testing.assert_allclose(
+        [heights.min(), heights.max()], [-grasp_object.height_m / 2, grasp_object.height_m / 2], atol=1e-6
+    )
+    assert 0.05 <= grasp_object.mass_kg <= 0.35
+    assert world.model.body("object").mass[0] == pytest.approx(grasp_object.mass_kg)
 
 
 def test_a_turned_part_weighs_by_its_volume() -> None:
-    cylinder, cone = turned(((0.0, 0.03), (0.06, 0.03), (0.12, 0.0)), 0.4, _RGBA)
+    cylinder, cone = make_homogeneous_lathe(((0.0, 0.03), (0.06, 0.03), (0.12, 0.0)), 0.4, _RGBA)
     assert (cylinder.mass_kg, cone.mass_kg) == (pytest.approx(0.3), pytest.approx(0.1))
 
 
 def test_a_wall_is_hollow_and_has_no_gaps() -> None:
-    staves = wall((0.02, 0.03), (0.02, 0.03), (0.0, 0.1), 0.16, _RGBA)
+    staves = make_wall((0.02, 0.03), (0.02, 0.03), (0.0, 0.1), 0.16, _RGBA)
     assert sum(stave.mass_kg for stave in staves) == pytest.approx(0.16)
     bearings = [np.arctan2(s.corners()[:, 1].mean(), s.corners()[:, 0].mean()) for s in staves]
     np.testing.assert_allclose(np.diff(np.unwrap(bearings)), 2 * np.pi / len(staves))

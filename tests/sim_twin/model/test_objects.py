@@ -17,10 +17,10 @@ def test_there_are_the_papers_three_objects_and_at_least_twelve_more() -> None:
     [("bottle", (0.066, 0.066, 0.2), 0.30), ("box", (0.07, 0.04, 0.15), 0.25), ("cylinder", (0.06, 0.06, 0.15), 0.20)],
 )
 def test_objects_have_the_size_and_mass_they_are_sold_with(name: str, size_m: tuple, mass_kg: float) -> None:
-    thing = OBJECTS[name]
-    np.testing.assert_allclose(np.ptp(thing.corners(), axis=0), size_m, atol=2e-4)
-    assert thing.mass_kg == pytest.approx(mass_kg)
-    assert thing.height_m == pytest.approx(size_m[2])
+    grasp_object = OBJECTS[name]
+    np.testing.assert_allclose(np.ptp(grasp_object.corners(), axis=0), size_m, atol=2e-4)
+    assert grasp_object.mass_kg == pytest.approx(mass_kg)
+    assert grasp_object.height_m == pytest.approx(size_m[2])
 
 
 def test_the_compiled_inertia_is_that_of_a_solid_cylinder() -> None:

@@ -1,26 +1,29 @@
 import numpy as np
 import pytest
 
+from hal.base.errors import InvalidValueError
 from sim_twin.model.objects import OBJECT_NAMES, OBJECTS
 from sim_twin.model.scene import SceneConfig
+from tests.support.errors import raises
 
 
 @pytest.mark.parametrize(
-    ("field", "value", "words"),
+    ("field", "value", "code", "allowed"),
     [
-        ("object", "teapot", "bottle, box, cylinder"),
-        ("distance_m", 0.9, "0.3 to 0.65 m"),
-        ("distance_m", float("nan"), "0.3 to 0.65 m"),
-        ("lateral_m", -0.4, "-0.25 to 0.25 m"),
-        ("pitch_deg", 80.0, "-60 to 60 degrees"),
-        ("seed", -1, "whole number"),
-        ("seed", 1.5, "whole number"),
+        ("object", "teapot", "unknown_object", "bottle, box, cylinder"),
+        ("distance_m", 0.9, "scene_range", "0.3 to 0.65"),
+        ("distance_m", float("nan"), "scene_range", "0.3 to 0.65"),
+        ("lateral_m", -0.4, "scene_range", "-0.25 to 0.25"),
+        ("pitch_deg", 80.0, "scene_range", "-60 to 60"),
+        ("seed", -1, "scene_seed", "whole number"),
+        ("seed", 1.5, "scene_seed", "whole number"),
     ],
 )
-def test_a_bad_field_is_refused_with_what_is_allowed(field: str, value: object, words: str) -> None:
-    with pytest.raises(ValueError, match=words) as caught:
+def test_a_bad_field_is_rejected_with_value_and_range(field: str, value: object, code: str, allowed: str) -> None:
+    with raises(InvalidValueError, code) as caught:
         SceneConfig(**{field: value})  # type: ignore[arg-type]
     assert repr(value) in str(caught.value)
+    assert allowed in str(caught.value)
 
 
 @pytest.mark.parametrize("name", OBJECT_NAMES)

@@ -115,9 +115,9 @@ def test_a_held_object_is_lifted_and_neither_slips_nor_sinks_in(name: str) -> No
     assert world.T_base_object()[2, 3] - height > 0.05
     assert deepest > -1e-3
     for earlier in (before, after_lift):
-        turned = np.arccos(np.clip((np.trace(earlier[:3, :3].T @ after[:3, :3]) - 1) / 2, -1, 1))
+        make_homogeneous_lathe = np.arccos(np.clip((np.trace(earlier[:3, :3].T @ after[:3, :3]) - 1) / 2, -1, 1))
         assert np.linalg.norm(after[:3, 3] - earlier[:3, 3]) < 1e-3
-        assert np.rad2deg(turned) < 1.0
+        assert np.rad2deg(make_homogeneous_lathe) < 1.0
 
 
 @pytest.mark.parametrize("pitch_deg", [-45.0, 45.0])

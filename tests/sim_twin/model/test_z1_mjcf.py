@@ -9,6 +9,7 @@ import trimesh
 from hal.base import z1
 from sim_twin.model.convex import load_link_mesh, split_convex
 from sim_twin.model.world import World
+from sim_twin.model.z1_mjcf import add_z1
 
 LINKS = ("link01", "link02", "link03", "link04", "link05", "link06", "gripperStator", "gripperMover")
 
@@ -59,6 +60,30 @@ def test_masses_are_the_urdfs_plus_a_hundred_grams_of_camera(world: World) -> No
             assert world.model.body(name).mass[0] == pytest.approx(float(mass.get("value", "nan")))
     mount = world.model.body("camera").mass[0] + world.model.body("camera_bracket").mass[0]
     assert mount == pytest.approx(0.100)
+
+
+def test_inertias_places_axes_and_damping_are_the_urdfs_to_the_last_bit() -> None:
+    def numbers(element, key: str) -> list[float]:
+        return [float(part) for part in element.get(key).split()]
+
+    spec = mujoco.MjSpec()
+    for material in ("link", "dark", "jaw", "camera", "bracket"):
+        spec.add_material(name=material)
+    add_z1(spec)
+    root = ElementTree.parse(z1.urdf_path()).getroot()
+    for link in root.findall("link[inertial]"):
+        body, inertial = spec.body(link.get("name")), link.find("inertial")
+        assert body.mass == float(inertial.find("mass").get("value"))
+        assert body.ipos.tolist() == numbers(inertial.find("origin"), "xyz")
+        keys = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
+        assert body.fullinertia.tolist() == [float(inertial.find("inertia").get(key)) for key in keys]
+    for joint in root.findall("joint[parent]"):
+        body = spec.body(joint.find("child").get("link"))
+        assert body.pos.tolist() == numbers(joint.find("origin"), "xyz")
+        assert len(body.joints) == (joint.get("type") == "revolute")
+        for own in body.joints:
+            assert own.axis.tolist() == numbers(joint.find("axis"), "xyz")
+            assert own.damping[0] == float(joint.find("dynamics").get("damping"))
 
 
 @pytest.mark.parametrize(("jaw", "offset", "side"), [("gripperStator", 0.049, 1.0), ("gripperMover", 0.0, -1.0)])

@@ -11,7 +11,7 @@ from hal.base import z1
 from hal.base.errors import InvalidValueError
 from hal.base.messages import RgbdFrame
 from hal.base.transforms import inverse, transform_points
-from sim_twin.benchmark.episodes.trial import look
+from sim_twin.benchmark.episodes.execution import capture
 from sim_twin.model.scene import SceneConfig
 from tests.support.errors import raises
 from z1_runtime.config import RuntimeConfig
@@ -25,7 +25,7 @@ CHECK = ExtrinsicsCheck()
 
 def taken(scene: SceneConfig) -> tuple[RgbdFrame, float, np.ndarray]:
     """Return the twin's frame from home, the jaw angle, and the true extrinsics (4, 4)."""
-    frame, q = look(scene)
+    frame, q = capture(scene)
     return frame, float(q[-1]), scene.T_flange_camera()
 
 

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from sim_twin.benchmark.episodes.episode import run_scenario
+from sim_twin.benchmark.episodes.execution import EpisodeRobot, Mode, capture
 from sim_twin.benchmark.episodes.methods import METHODS
 from sim_twin.benchmark.episodes.runner import make_tasks, run_task
 from sim_twin.benchmark.episodes.scenarios import Scenario
-from sim_twin.benchmark.episodes.trial import Mode, Robot, look
 from sim_twin.model.scene import SceneConfig
 from z1_runtime.config import RuntimeConfig
 from z1_runtime.factory import make_grasp_selector
@@ -61,11 +61,11 @@ def test_a_row_holds_what_a_scoring_head_is_fitted_to(rows, decider):
 
 
 def test_an_object_that_is_not_where_it_was_seen_is_not_called_lifted(decider):
-    frame, q = look(SCENARIO.scene())
+    frame, q = capture(SCENARIO.scene())
     plan = decider.select(frame, q).plan
     elsewhere = SceneConfig(object="cylinder", distance_m=0.60, lateral_m=0.20)
-    with Robot(elsewhere, decider.kinematics) as robot:
-        outcome = robot.act(plan)
+    with EpisodeRobot(elsewhere, decider.kinematics) as robot:
+        outcome = robot.execute(plan)
     assert outcome.mode is Mode.MISSED
     assert outcome.lifted_m < 0.01
 

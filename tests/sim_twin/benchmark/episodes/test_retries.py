@@ -6,9 +6,9 @@ import pytest
 from hal.base import z1
 from sim_twin.benchmark.episodes import episode
 from sim_twin.benchmark.episodes.episode import run_scenario
+from sim_twin.benchmark.episodes.execution import EpisodeRobot, Mode, Outcome, capture
 from sim_twin.benchmark.episodes.methods import METHODS
 from sim_twin.benchmark.episodes.scenarios import Scenario
-from sim_twin.benchmark.episodes.trial import Mode, Outcome, Robot, look
 from z1_runtime.config import RuntimeConfig
 from z1_runtime.factory import make_grasp_selector
 
@@ -26,9 +26,9 @@ class Grasped:
 
     def __init__(self, monkeypatch, missing: int) -> None:
         self.plans, self.heights_m, self.starts = [], [], []
-        real = Robot.act
+        real = EpisodeRobot.execute
 
-        def act(robot, plan):
+        def execute(robot, plan):
             self.plans.append(plan)
             self.starts.append(robot.world.read_arm()[0])
             if len(self.plans) > missing:
@@ -39,7 +39,7 @@ class Grasped:
             self.heights_m.append(robot.world.lifted_m())
             return outcome
 
-        monkeypatch.setattr(Robot, "act", act)
+        monkeypatch.setattr(EpisodeRobot, "execute", execute)
 
 
 def test_after_a_miss_the_object_is_found_where_it_then_is(decider, monkeypatch):
@@ -69,8 +69,8 @@ def test_each_attempt_has_candidates_of_its_own_and_the_row_is_of_the_last(decid
         return decider
 
     outcomes = iter([Mode.MISSED, Mode.DROPPED, Mode.SLIPPED])
-    monkeypatch.setattr(Robot, "act", lambda *_: Outcome(mode=next(outcomes)))
-    monkeypatch.setattr(Robot, "withdraw", lambda *_: None)
+    monkeypatch.setattr(EpisodeRobot, "execute", lambda *_: Outcome(mode=next(outcomes)))
+    monkeypatch.setattr(EpisodeRobot, "withdraw", lambda *_: None)
     (row,) = run_scenario(SCENARIO, [MVB], make, top_k=3)
     assert row["modes"] == ["missed", "dropped", "slipped"]
     assert row["mode"] == "slipped"
@@ -78,7 +78,7 @@ def test_each_attempt_has_candidates_of_its_own_and_the_row_is_of_the_last(decid
 
 
 def test_an_object_that_has_gone_ends_the_episode_with_the_reason(decider, monkeypatch):
-    monkeypatch.setattr(Robot, "act", lambda *_: Outcome(mode=Mode.KNOCKED))
+    monkeypatch.setattr(EpisodeRobot, "execute", lambda *_: Outcome(mode=Mode.KNOCKED))
     real = episode.occlude
     covered = []
 
@@ -94,16 +94,16 @@ def test_an_object_that_has_gone_ends_the_episode_with_the_reason(decider, monke
 
 @pytest.mark.parametrize("mode", [Mode.TABLE_COLLISION, Mode.STOPPED])
 def test_what_would_stop_a_real_arm_is_not_tried_again(decider, monkeypatch, mode):
-    monkeypatch.setattr(Robot, "act", lambda *_: Outcome(mode=mode))
+    monkeypatch.setattr(EpisodeRobot, "execute", lambda *_: Outcome(mode=mode))
     (row,) = run_scenario(SCENARIO, [MVB], lambda *_: decider, top_k=3)
     assert (row["attempts"], row["modes"]) == (1, [mode.value])
 
 
 def test_what_slipped_but_hangs_is_put_down_before_the_jaws_open(decider):
-    frame, q = look(SCENARIO.scene())
+    frame, q = capture(SCENARIO.scene())
     plan = decider.select(frame, q).plan
-    with Robot(SCENARIO.scene(), decider.kinematics) as robot:
-        outcome = robot.act(plan)
+    with EpisodeRobot(SCENARIO.scene(), decider.kinematics) as robot:
+        outcome = robot.execute(plan)
         assert outcome.mode is Mode.SUCCESS
         assert robot.world.lifted_m() > 0.05
         robot.withdraw(plan, replace(outcome, mode=Mode.SLIPPED), -1.0)

@@ -1,7 +1,9 @@
 import pytest
 
+from hal.base.errors import InvalidValueError
 from sim_twin.benchmark.episodes.scenarios import OBJECT_SETS, PAPER_OBJECTS, Scenario, grid
 from sim_twin.model.objects import EXTENDED_OBJECTS
+from tests.support.errors import raises
 
 
 def test_the_paper_has_81_scenarios_and_each_has_its_own_name_and_noise():
@@ -30,15 +32,15 @@ def test_seeds_and_occlusions_multiply_the_poses():
 
 
 @pytest.mark.parametrize(
-    ("field", "value", "said"),
+    ("field", "value"),
     [
-        ("object", "banana", "bottle"),
-        ("distance", "close", "near"),
-        ("occlusion", 1.0, "0 up to"),
-        ("seed", -1, "seed"),
+        ("object", "banana"),
+        ("distance", "close"),
+        ("occlusion", 1.0),
+        ("seed", -1),
     ],
 )
-def test_an_impossible_scenario_says_what_is_possible(field, value, said):
+def test_an_invalid_scenario_is_rejected(field, value):
     good = {"object": "box", "distance": "mid", "lateral": "left", "pitch_deg": 0.0}
-    with pytest.raises(ValueError, match=said):
+    with raises(InvalidValueError, f"scenario_{field}"):
         Scenario(**{**good, field: value})

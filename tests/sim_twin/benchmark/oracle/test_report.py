@@ -14,7 +14,7 @@ def make_rows():
     for scenario in grid():
         fails = scenario.object == "bottle" and scenario.pitch_deg == -45.0
         modes = ["missed"] * 3 + ["dropped"] if fails else ["missed"] * (scenario.distance == "far") + ["success"]
-        row = {**scenario.features(), "method": "oracle", "success": not fails, "modes": modes}
+        row = {**scenario.columns(), "method": "oracle", "success": not fails, "modes": modes}
         row |= {"verdict": "unsolved" if fails else "solved", "executions": len(modes), "exhausted": fails}
         rows.append(row | {"n_reachable": 0 if fails else 120})
     return rows
@@ -34,7 +34,7 @@ def test_the_summary_counts_what_is_solved_and_how_soon():
 
 def test_methods_are_measured_by_what_can_be_solved_whatever_their_seed():
     bench = [
-        {**scenario.features(), "method": "full", "success": scenario.object != "box"} for scenario in grid(seeds=(3,))
+        {**scenario.columns(), "method": "full", "success": scenario.object != "box"} for scenario in grid(seeds=(3,))
     ]
     bench.append({**bench[0], "method": "full", "object": "mug"})  # the oracle was not asked about it
     full = summarise(make_rows(), bench)["methods"]["full"]

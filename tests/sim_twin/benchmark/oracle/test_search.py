@@ -1,15 +1,17 @@
 import numpy as np
 import pytest
 
+from hal.base.errors import InvalidValueError
+from sim_twin.benchmark.episodes.execution import EpisodeRobot, Mode, Outcome
 from sim_twin.benchmark.episodes.scenarios import Scenario
-from sim_twin.benchmark.episodes.trial import Mode, Outcome, Robot
-from sim_twin.benchmark.oracle import options as oracle_options
+from sim_twin.benchmark.oracle import reachable_grasps
 from sim_twin.benchmark.oracle.candidates import SweepConfig, sweep_grasps
-from sim_twin.benchmark.oracle.options import EXACT_PLANNER, TrueScene
+from sim_twin.benchmark.oracle.reachable_grasps import EXACT_PLANNER, GroundTruthScene
 from sim_twin.benchmark.oracle.search import OracleConfig, search
 from sim_twin.benchmark.oracle.surface import Surface
 from sim_twin.model.objects import OBJECTS
 from sim_twin.model.parts import GraspObject, Part
+from tests.support.errors import raises
 from z1_runtime.geometry.kinematics import Kinematics
 
 BOX = Scenario(object="box", distance="mid", lateral="centre", pitch_deg=0.0)
@@ -17,8 +19,8 @@ FEW = SweepConfig(n_points=60, n_approaches=8, cell_m=0.02)
 
 
 @pytest.fixture(scope="module")
-def options():
-    return TrueScene(BOX.scene(), Kinematics(), EXACT_PLANNER, 0.5).options(FEW)
+def find_grasps():
+    return GroundTruthScene(BOX.scene(), Kinematics(), EXACT_PLANNER, 0.5).find_grasps(FEW)
 
 
 def test_a_boxs_surface_is_sampled_on_all_six_sides_with_outward_normals():
@@ -36,12 +38,12 @@ def test_no_point_of_a_surface_is_inside_the_object(name):
     surface = Surface(OBJECTS[name])
     points, normals = surface.sample(0.003)
     just_outside = points + 3e-4 * normals
-    assert not any(hull.holds(just_outside).any() for hull in surface._hulls)
+    assert not any(hull.contains(just_outside).any() for hull in surface._hulls)
 
 
 def test_a_chord_through_a_mug_ends_at_its_wall_and_at_the_far_side():
     surface = Surface(OBJECTS["mug"])
-    wall, far = surface.chords(np.array([[-0.0315, 0.0, 0.0]]), np.array([[1.0, 0.0, 0.0]]))
+    wall, far = surface.trace_chords(np.array([[-0.0315, 0.0, 0.0]]), np.array([[1.0, 0.0, 0.0]]))
     assert wall.points[0, 0] == pytest.approx(-0.0275, abs=1e-3)
     assert far.points[0, 0] == pytest.approx(0.0315, abs=1e-3)
     assert far.normals[0] @ [1.0, 0.0, 0.0] > 0.98
@@ -64,33 +66,34 @@ def test_grasps_come_from_all_sides_but_from_below_with_contacts_on_the_surface(
         assert np.abs(np.abs(contacts / [0.035, 0.020, 0.075]).max(axis=1) - 1.0).max() < 1e-6
 
 
-def test_after_a_failure_what_is_unlike_it_comes_next_and_copies_never(options):
+def test_after_a_failure_what_is_unlike_it_comes_next_and_copies_never(find_grasps):
     tried = []
-    while (option := options.next()) is not None:
-        options.fail(option)
+    while (option := find_grasps.next()) is not None:
+        find_grasps.add_failure(option)
         tried.append(option)
-    best = np.argsort(-options._worth)[:6]
-    assert 20 < len(tried) < len(options)
+    best = np.argsort(-find_grasps._value)[:6]
+    assert 20 < len(tried) < len(find_grasps)
     assert len({id(option) for option in tried}) == len(tried)
-    assert _spread(tried[:6]) > 1.2 * _spread([options._options[k] for k in best])
+    assert _spread(tried[:6]) > 1.2 * _spread([find_grasps._grasps[k] for k in best])
 
 
 def _spread(some):
-    """Return the mean distance between the ways of `some`: of directions and, ten times as dear, of metres."""
-    traits = np.array([oracle_options._traits(option.way) for option in some]) * np.repeat([1.0, 10.0], [6, 3])
+    """Return the mean distance between `some` placements: of directions and, weighted tenfold, of metres."""
+    descriptors = [reachable_grasps._descriptor(grasp.placement) for grasp in some]
+    traits = np.array(descriptors) * np.repeat([1.0, 10.0], [6, 3])
     return np.linalg.norm(traits[:, None] - traits[None], axis=2).mean()
 
 
-def test_a_finer_sweep_remembers_what_failed(options):
-    truth = TrueScene(BOX.scene(), Kinematics(), EXACT_PLANNER, 0.5)
-    first, again = truth.options(FEW), truth.options(FEW)
+def test_a_finer_sweep_remembers_what_failed(find_grasps):
+    truth = GroundTruthScene(BOX.scene(), Kinematics(), EXACT_PLANNER, 0.5)
+    first, again = truth.find_grasps(FEW), truth.find_grasps(FEW)
     best = first.next()
     assert best is not None
-    first.fail(best)
-    assert first.joined(again).next() is not None
+    first.add_failure(best)
+    assert first.with_failures(again).next() is not None
     following = again.next()
     assert following is not None
-    assert not np.allclose(following.way.T_base_pivot, best.way.T_base_pivot)
+    assert not np.allclose(following.placement.T_base_pivot, best.placement.T_base_pivot)
 
 
 def test_an_upright_box_is_lifted_by_the_first_grasp():
@@ -122,7 +125,7 @@ def test_where_all_fails_the_budget_is_spent_on_grasps_that_differ(monkeypatch):
         plans.append(plan)
         return Outcome(mode=Mode.MISSED)
 
-    monkeypatch.setattr(Robot, "act", miss)
+    monkeypatch.setattr(EpisodeRobot, "execute", miss)
     row = search(BOX, OracleConfig(sweep=FEW, finer=FEW, executions=6, finer_after=3))
     assert row["verdict"] == "unsolved"
     assert row["modes"] == ["missed"] * 6
@@ -135,7 +138,7 @@ def test_where_all_fails_the_budget_is_spent_on_grasps_that_differ(monkeypatch):
 
 
 def test_a_search_says_the_same_each_time(monkeypatch):
-    monkeypatch.setattr(Robot, "act", lambda *_: Outcome(mode=Mode.DROPPED))
+    monkeypatch.setattr(EpisodeRobot, "execute", lambda *_: Outcome(mode=Mode.DROPPED))
     config = OracleConfig(sweep=FEW, executions=2)
     first, second = (search(BOX, config) for _ in range(2))
     for row in (first, second):
@@ -144,5 +147,5 @@ def test_a_search_says_the_same_each_time(monkeypatch):
 
 
 def test_an_empty_budget_is_refused():
-    with pytest.raises(ValueError, match="0, 600 and 12"):
+    with raises(InvalidValueError, "oracle_budget"):
         OracleConfig(executions=0)

@@ -17,7 +17,7 @@ def row(method, mode, qpos=(0.0,), **more):
 def test_failure_modes_take_turns_and_what_never_moved_is_left_out():
     rows = [row("mvb", "missed", n=n) for n in range(5)]
     rows += [row("mvb", "success"), row("mvb", "no IK", qpos=None), row("full", "missed"), row("mvb", "slipped")]
-    chosen = choose_failures(rows, most=4)
+    chosen = choose_failures(rows, maximum=4)
     assert [(r["method"], r["mode"]) for r in chosen] == [
         ("mvb", "missed"), ("full", "missed"), ("mvb", "slipped"), ("mvb", "missed")
     ]  # fmt: skip
@@ -25,7 +25,7 @@ def test_failure_modes_take_turns_and_what_never_moved_is_left_out():
 
 def test_a_row_says_which_scenario_it_is():
     for scenario in grid(occlusions=(0.25,)):
-        assert Scenario.of(scenario.features() | {"method": "mvb"}) == scenario
+        assert Scenario.from_row(scenario.columns() | {"method": "mvb"}) == scenario
 
 
 def test_the_final_state_is_drawn_from_the_row(tmp_path, monkeypatch: pytest.MonkeyPatch):
@@ -33,13 +33,13 @@ def test_the_final_state_is_drawn_from_the_row(tmp_path, monkeypatch: pytest.Mon
     monkeypatch.setattr(pictures, "_SIZE", (240, 135))
     scenario = Scenario(object="mug", distance="mid", lateral="centre", pitch_deg=0.0)
     qpos = World(scenario.scene()).data.qpos.tolist()
-    rows = [scenario.features() | row("mvb:k=3", "missed", qpos) | {"scenario": scenario.key}]
+    rows = [scenario.columns() | row("mvb:k=3", "missed", qpos) | {"scenario": scenario.key}]
     shown = draw_pictures(rows, "failures", tmp_path / "pictures")
     (file,) = (tmp_path / "pictures").iterdir()
     assert file.name == "mug-mid-centre-+0-s0-mvb_k_3.png"
     ((of, picture),) = shown
     assert of is rows[0]
-    assert picture.words == "mug-mid-centre-+0-s0, mvb:k=3: missed"
+    assert picture.caption == "mug-mid-centre-+0-s0, mvb:k=3: missed"
     large, small = Image.open(file).convert("RGB"), Image.open(io.BytesIO(picture.jpeg))
     again = np.asarray(small.resize(large.size), dtype=float)
     assert np.abs(again - np.asarray(large)).mean() < 8.0

@@ -1,7 +1,8 @@
 import pyarrow.parquet as pq
-import pytest
 
+from hal.base.errors import OutputExistsError
 from sim_twin.benchmark.results.store import Store
+from tests.support.errors import raises
 
 
 def rows(scenario, **more):
@@ -22,7 +23,7 @@ def test_rows_come_back_sorted_whatever_their_columns(tmp_path):
 
 def test_a_second_run_does_not_mix_with_the_first_unless_told(tmp_path):
     Store(tmp_path, resume=False).add(rows("a"))
-    with pytest.raises(FileExistsError, match="--resume"):
+    with raises(OutputExistsError, "output_exists"):
         Store(tmp_path, resume=False)
     assert Store(tmp_path, resume=True).done() == {("a", "vanilla"), ("a", "mvb")}
 

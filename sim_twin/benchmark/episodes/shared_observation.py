@@ -1,4 +1,4 @@
-"""What all methods share of one look at a scene: they rank the very same candidates."""
+"""One observation of a scene, shared by all methods: they rank the same candidates."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from z1_runtime.types import Observation
 
 
 class SharedObservation:
-    """A frame, what perception made of it, and what the generator proposed.
+    """A frame with its observation and the generator's candidates.
 
     Args:
         frame: as the camera gave it.
@@ -36,11 +36,11 @@ class SharedObservation:
 
     @classmethod
     def by(cls, decider: GraspSelector, frame: RgbdFrame, q: np.ndarray, times: StageTimes) -> SharedObservation:
-        """Return what `decider` sees in `frame`, taken at joints `q` (7,), and proposes for it; `times` gets the time.
+        """Return observation and candidates of `decider` for `frame`, taken at joints `q` (7,); `times` gets the time.
 
         Raises:
-            PerceptionError: nothing usable was seen.
-            ValueError: the generator can make nothing of the cloud.
+            PerceptionError: nothing usable was detected.
+            ValueError: the generator cannot use the cloud.
         """
         observation = decider.observe(frame, q, times)
         with times.stage("generate"):

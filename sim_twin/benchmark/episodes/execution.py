@@ -1,4 +1,4 @@
-"""Executes plans in the twin and says, by the twin's own truth, how they ended."""
+"""Execution of plans in the twin, with the outcome by the twin's ground truth."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from hal.base.messages import RgbdFrame
 from hal.servo.guard import Guard
 from hal.servo.servo import Servo
 from sim_twin.backends import make_rig
-from sim_twin.benchmark.episodes.watch import KNOCKED_M, KNOCKED_RAD, Watch
+from sim_twin.benchmark.episodes.contact_monitor import KNOCKED_M, KNOCKED_RAD, ContactMonitor
 from sim_twin.model.scene import SceneConfig
 from sim_twin.model.world import World
 from z1_runtime.geometry.kinematics import Kinematics
@@ -23,14 +23,14 @@ from z1_runtime.motion.executor import Executor, MotionError
 from z1_runtime.motion.trajectory import MotionLimits, PathFailure, hold, joint_move, straight_move
 from z1_runtime.types import GraspPlan, JointTrajectory
 
-UP_M, SLIP_M, HOLD_S, ASIDE_M = 0.05, 0.02, 1.0, 0.03
-"""Success: at least 50 mm up for 1 s after a lift and a 30 mm move aside, and less than 20 mm of slip in the hand."""
-_TABLE_N = 5.0
+MIN_LIFT_M, MAX_SLIP_M, HOLD_S, CARRY_M = 0.05, 0.02, 1.0, 0.03
+"""Success: at least 50 mm up for 1 s after a lift and a 30 mm sideways move, and under 20 mm of slip in the jaws."""
+_MAX_TABLE_FORCE_N = 5.0
 _FRAME_TIMEOUT_S = 1.0
 
 
 class Mode(StrEnum):
-    """How an episode ended."""
+    """Outcome of an episode."""
 
     SUCCESS = "success"
     NO_DETECTION = "no detection"
@@ -44,50 +44,52 @@ class Mode(StrEnum):
     DROPPED = "dropped"
     STOPPED = "arm stopped"
     """The servo braked: a limit, a stall, or a joint that did not follow."""
+    ERROR = "error"
+    """An exception, a defect of this software, ended the episode; its row keeps the exception's type and text."""
 
 
 RETRIED = (Mode.MISSED, Mode.KNOCKED, Mode.SLIPPED, Mode.DROPPED)
-"""Failures after which another look and another attempt are worth it."""
+"""Failures that are followed by another observation and attempt."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Outcome:
-    """What became of one executed plan; NaN where it did not come that far."""
+    """Result of one executed plan; NaN for stages that were not reached."""
 
     mode: Mode
     displacement_m: float = np.nan
-    """Most that the object moved before the jaws began to close [m]."""
+    """Maximum displacement of the object before the jaws began to close [m]."""
     tilt_rad: float = np.nan
-    """Most that it turned before then [rad]."""
+    """Maximum turn of the object before then [rad]."""
     table_force_n: float = np.nan
-    """Most force between arm and table [N]."""
+    """Maximum force between arm and table [N]."""
     jaws_touching: int = 0
     """Jaws on the object once closed."""
     jaw: float = np.nan
-    """Mover angle once closed [rad]."""
+    """Jaw angle once closed [rad]."""
     jaw_torque_nm: float = np.nan
     """Gripper torque once closed [Nm]."""
     slip_m: float = np.nan
-    """How far the object moved in the hand, from closed to the end [m]."""
+    """Displacement of the object in the jaws, from closed to the end [m]."""
     lifted_m: float = np.nan
-    """Least height over its start during the last second [m]."""
+    """Minimum height over its start during the last second [m]."""
     neighbours_knocked: int = 0
     """Neighbours that were moved by more than 15 mm or 15° since the episode began."""
     duration_s: float = np.nan
     """From the first motion to the end, on the robot's clock [s]."""
     detail: str = ""
-    """A sentence, where there is more to say."""
+    """Explanation, if any."""
 
 
-class Robot:
-    """A lock-step arm at home in a scene of its own, with its camera and an impartial observer; use it with `with`."""
+class EpisodeRobot:
+    """A lock-step arm at home in a scene of its own, with camera and ground-truth monitor; use it with `with`."""
 
     def __init__(self, scene: SceneConfig, kinematics: Kinematics | None = None, speed: float = 0.5) -> None:
         rig = make_rig(scene, lockstep=True)
         assert rig.call_every_tick is not None
         self.world: World = rig.world
         self._rig, self._undo = rig, ExitStack()
-        self._servo, self._watch = Servo(rig.arm, rig.clock, guard=Guard()), Watch(rig.world)
+        self._servo, self._watch = Servo(rig.arm, rig.clock, guard=Guard()), ContactMonitor(rig.world)
         self._executor = Executor(self._servo, rig.clock)
         self._kinematics, self._limits = kinematics or Kinematics(), MotionLimits.at_speed(speed)
         self._sees = False
@@ -103,7 +105,7 @@ class Robot:
     def __exit__(self, *_: object) -> None:
         self._undo.close()
 
-    def look(self) -> tuple[RgbdFrame, np.ndarray]:
+    def capture(self) -> tuple[RgbdFrame, np.ndarray]:
         """Return the camera's next frame and the joints (7,) it was taken at [rad], once the arm rests."""
         if not self._sees:
             self._rig.camera.connect()
@@ -112,16 +114,16 @@ class Robot:
         state = self._executor.settle()
         return self._rig.camera.wait_for_frame(_FRAME_TIMEOUT_S), state.q
 
-    def act(self, plan: GraspPlan) -> Outcome:
-        """Grasp, lift, carry aside and hold; say how it ended."""
-        aside = carry(self._kinematics, plan, self._limits)
-        if aside is None:
-            return Outcome(mode=Mode.NO_PATH, detail="the lifted object cannot be moved 30 mm to any side.")
+    def execute(self, plan: GraspPlan) -> Outcome:
+        """Grasp, lift, carry sideways and hold; return the outcome."""
+        carry_motion = plan_carry(self._kinematics, plan, self._limits)
+        if carry_motion is None:
+            return Outcome(mode=Mode.NO_PATH, detail="carry: the lifted object cannot be moved 30 mm in any direction.")
         self._watch.begin()
         start_s = self.world.time_s
         known: dict[str, Any] = {}
         try:
-            self._grasp_and_lift(plan, aside, known)
+            self._grasp_and_lift(plan, carry_motion, known)
         except (MotionError, HalError) as error:
             outcome = Outcome(mode=Mode.STOPPED, detail=str(error), **known)
         else:
@@ -132,10 +134,10 @@ class Robot:
             neighbours_knocked=self._watch.neighbours_knocked(),
             duration_s=self.world.time_s - start_s,
         )
-        return outcome if outcome.mode is Mode.STOPPED else _judged(outcome)
+        return outcome if outcome.mode is Mode.STOPPED else _classify(outcome)
 
     def withdraw(self, plan: GraspPlan, outcome: Outcome, jaw_home: float) -> None:
-        """Go home with open jaws after a failed attempt at `plan`; what still hangs in them is put down first.
+        """Go home with open jaws after a failed attempt at `plan`; an object still held is put down first.
 
         Raises:
             MotionError, HalError: the arm does not get there.
@@ -147,8 +149,8 @@ class Robot:
                 self._executor.settle()
         self._move_to(np.append(z1.Q_HOME, jaw_home))
 
-    def _grasp_and_lift(self, plan: GraspPlan, aside: JointTrajectory, known: dict[str, Any]) -> None:
-        """Do it all, and write into `known` what there is to say as soon as it is known."""
+    def _grasp_and_lift(self, plan: GraspPlan, carry_motion: JointTrajectory, known: dict[str, Any]) -> None:
+        """Execute all motions, and write each figure into `known` as soon as it is known."""
         watch, executor = self._watch, self._executor
         for motion in (plan.transfer, plan.approach):
             executor.execute(motion)
@@ -156,41 +158,41 @@ class Robot:
         known |= {"displacement_m": watch.displacement_m, "tilt_rad": watch.tilt_rad}
         executor.execute(plan.close)
         state = executor.settle()
-        closed = watch.T_hand_object()
+        closed = watch.T_gripper_object()
         known |= {
             "jaws_touching": watch.jaws_touching(),
             "jaw": float(state.q[-1]),
             "jaw_torque_nm": float(state.tau[-1]),
         }
-        for motion in (plan.lift, aside):
+        for motion in (plan.lift, carry_motion):
             executor.execute(motion)
             executor.settle()
         watch.clear()
-        executor.execute(hold(aside.q[-1], HOLD_S))
-        known["slip_m"] = float(np.linalg.norm(watch.T_hand_object()[:3, 3] - closed[:3, 3]))
+        executor.execute(hold(carry_motion.q[-1], HOLD_S))
+        known["slip_m"] = float(np.linalg.norm(watch.T_gripper_object()[:3, 3] - closed[:3, 3]))
 
     def _move_to(self, q_goal: np.ndarray) -> None:
-        """Move straight in joint space from where the arm was last told to be to `q_goal` (7,) [rad]."""
+        """Move straight in joint space from the last commanded position to `q_goal` (7,) [rad]."""
         q = np.clip(self._servo.status().q_command, z1.Q_MIN, z1.Q_MAX)
         if np.abs(q - q_goal).max() > 1e-6:
             self._executor.execute(joint_move(q, q_goal, self._limits))
             self._executor.settle()
 
 
-def look(scene: SceneConfig) -> tuple[RgbdFrame, np.ndarray]:
+def capture(scene: SceneConfig) -> tuple[RgbdFrame, np.ndarray]:
     """Return the camera's frame from home and the joints (7,) it was taken at [rad]."""
-    with Robot(scene) as robot:
-        return robot.look()
+    with EpisodeRobot(scene) as robot:
+        return robot.capture()
 
 
-def carry(kinematics: Kinematics, plan: GraspPlan, limits: MotionLimits) -> JointTrajectory | None:
-    """Return the 30 mm sideways move that follows the lift: towards the middle if it can be, else another way."""
+def plan_carry(kinematics: Kinematics, plan: GraspPlan, limits: MotionLimits) -> JointTrajectory | None:
+    """Return the 30 mm sideways move that follows the lift: towards the middle if possible, else another direction."""
     start = plan.lift.q[-1]
     T = kinematics.pivot(start[:6])
     inwards = -np.sign(T[1, 3]) or 1.0
-    for aside in ((0.0, inwards), (0.0, -inwards), (-1.0, 0.0), (1.0, 0.0)):
+    for direction in ((0.0, inwards), (0.0, -inwards), (-1.0, 0.0), (1.0, 0.0)):
         T_goal = T.copy()
-        T_goal[:2, 3] += ASIDE_M * np.array(aside)
+        T_goal[:2, 3] += CARRY_M * np.array(direction)
         try:
             return straight_move(kinematics, T, T_goal, start, float(start[-1]), limits)
         except PathFailure:
@@ -203,17 +205,17 @@ def _reversed(motion: JointTrajectory) -> JointTrajectory:
     return JointTrajectory(t_s=motion.t_s[-1] - motion.t_s[::-1], q=motion.q[::-1], dq=-motion.dq[::-1])
 
 
-def _judged(outcome: Outcome) -> Outcome:
+def _classify(outcome: Outcome) -> Outcome:
     """Return `outcome` with the mode that its figures give; of several causes the first in time."""
-    if outcome.lifted_m >= UP_M and outcome.slip_m < SLIP_M:
+    if outcome.lifted_m >= MIN_LIFT_M and outcome.slip_m < MAX_SLIP_M:
         return outcome
-    if outcome.table_force_n > _TABLE_N:
+    if outcome.table_force_n > _MAX_TABLE_FORCE_N:
         mode = Mode.TABLE_COLLISION
     elif outcome.displacement_m > KNOCKED_M or outcome.tilt_rad > KNOCKED_RAD:
         mode = Mode.KNOCKED
     elif outcome.jaws_touching < 2:
         mode = Mode.MISSED
-    elif outcome.lifted_m >= UP_M:
+    elif outcome.lifted_m >= MIN_LIFT_M:
         mode = Mode.SLIPPED
     else:
         mode = Mode.DROPPED

@@ -1,4 +1,4 @@
-"""What `./z1 tune` reads: the rows of benchmark runs, and the grasps in them whose outcome is known."""
+"""Rows of benchmark runs for `./z1 tune`, and the grasps in them with a known outcome."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from z1_runtime.config import RuntimeConfig, config_from
 from z1_runtime.grasping.features import FEATURES
 
 Reading = Literal["top1", "fallthrough"]
-"""`top1`: the first-ranked grasp counts alone; `fallthrough`: the first that the arm can do is executed."""
+"""`top1`: only the first-ranked grasp counts; `fallthrough`: the first reachable one is executed."""
 Outcomes = dict[str, dict[str, bool]]
-"""By method and scenario, whether it succeeded."""
+"""Success by method and scenario."""
 
 
 class TuneError(UsageError):
-    """Rows that nothing can be learned from, or that do not belong together."""
+    """Rows without information for the tuning, or of runs that cannot be combined."""
 
     default_code = "tune"
 
@@ -36,7 +36,7 @@ class Logs:
 
     rows: list[Row]
     config: RuntimeConfig
-    """What they were run with."""
+    """Settings of the runs."""
     sources: tuple[str, ...]
 
     @property
@@ -45,7 +45,7 @@ class Logs:
         return tuple(sorted({row["seed"] for row in self.rows}))
 
 
-def read_logs(folders: Sequence[Path]) -> Logs:
+def load_logs(folders: Sequence[Path]) -> Logs:
     """Return the rows of benchmark runs, each scenario and method once.
 
     Args:
@@ -58,46 +58,55 @@ def read_logs(folders: Sequence[Path]) -> Logs:
     rows: dict[tuple[str, str], Row] = {}
     configs: dict[str, RuntimeConfig] = {}
     for folder in folders:
-        configs[str(folder)] = _settings(folder)
-        for row in _rows(folder):
+        configs[str(folder)] = _load_settings(folder)
+        for row in _load_rows(folder):
             rows.setdefault((row["scenario"], row["method"]), row)
     if not rows:
-        raise TuneError("no folder was given, or none holds episodes; give the --out of a `./z1 bench`.")
+        raise TuneError(
+            "tune: there are no logs (0 folders with episodes, allowed 1 or more). Give the --out of a `./z1 bench`.",
+            code="no_logs",
+        )
     first, config = next(iter(configs.items()))
     for other, settings in configs.items():
         if settings != config:
-            raise TuneError(f"{first} and {other} were run with different settings; tune on runs with the same ones.")
+            raise TuneError(
+                f"tune: {first} and {other} were run with different settings. Give runs with the same settings.",
+                code="different_settings",
+            )
     ordered = [rows[key] for key in sorted(rows)]
     return Logs(rows=ordered, config=config, sources=tuple(configs))
 
 
-def _settings(folder: Path) -> RuntimeConfig:
+def _load_settings(folder: Path) -> RuntimeConfig:
     path = folder / "summary.json"
     try:
         settings = json.loads(path.read_text(encoding="utf-8"))["run"]["settings"]
     except (OSError, KeyError, json.JSONDecodeError) as error:
         raise TuneError(
-            f"{path} does not say with which settings the episodes were run; give the --out of a `./z1 bench` that "
-            "came to its end."
+            f"tune: {path} has no settings of the run. Give the --out of a `./z1 bench` that has completed.",
+            code="no_settings",
         ) from error
     return config_from(settings, f"{path}: settings")
 
 
-def _rows(folder: Path) -> list[Row]:
-    """Return a run's rows, from its one table, or while it still runs from the folder of small ones."""
+def _load_rows(folder: Path) -> list[Row]:
+    """Return a run's rows, from its table or, before its end, from the folder of small files."""
     table = folder / TABLE
     paths = [table] if table.exists() else sorted((folder / FOLDER).glob("*.parquet"))
     if not paths:
-        raise TuneError(f"{folder} holds no episodes; give the --out of a `./z1 bench`.")
+        raise TuneError(
+            f"tune: {folder} has no episodes (0 files, allowed 1 or more). Give the --out of a `./z1 bench`.",
+            code="no_episodes",
+        )
     return pa.concat_tables([pq.read_table(path) for path in paths], promote_options="permissive").to_pylist()
 
 
-def pose_of(row: Mapping[str, Any]) -> str:
-    """Return the scenario of a row without its seed: what may not stand on both sides of a cross-validation."""
+def scenario_pose(row: Mapping[str, Any]) -> str:
+    """Return the scenario of a row without its seed, the group of the cross-validation."""
     return row["scenario"].rpartition("-s")[0]
 
 
-def worked(row: Mapping[str, Any], reading: Reading) -> bool:
+def is_success(row: Mapping[str, Any], reading: Reading) -> bool:
     """Return whether the first attempt of an episode succeeded."""
     if reading == "top1":
         return bool(row["success_top1"])
@@ -105,21 +114,21 @@ def worked(row: Mapping[str, Any], reading: Reading) -> bool:
     return bool(after[0]) if after else bool(row["success"])
 
 
-def outcomes(rows: Iterable[Row], reading: Reading) -> Outcomes:
-    """Return who succeeded where."""
+def collect_outcomes(rows: Iterable[Row], reading: Reading) -> Outcomes:
+    """Return the successes by method and scenario."""
     by_method: Outcomes = {}
     for row in rows:
-        by_method.setdefault(row["method"], {})[row["scenario"]] = worked(row, reading)
+        by_method.setdefault(row["method"], {})[row["scenario"]] = is_success(row, reading)
     return by_method
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Samples:
-    """N grasps whose outcome is known, none twice."""
+    """N different grasps with a known outcome."""
 
-    measured: np.ndarray
+    features: np.ndarray
     """(N, 11) as `z1_runtime.grasping.features.measure` returns it."""
-    worked: np.ndarray
+    success: np.ndarray
     """(N,) bool."""
     poses: np.ndarray
     """(N,) the scenarios without their seeds."""
@@ -127,12 +136,12 @@ class Samples:
     """(N,) names."""
 
     def __len__(self) -> int:
-        return len(self.worked)
+        return len(self.success)
 
     def __getitem__(self, index: np.ndarray) -> Samples:
         return Samples(
-            measured=self.measured[index],
-            worked=self.worked[index],
+            features=self.features[index],
+            success=self.success[index],
             poses=self.poses[index],
             objects=self.objects[index],
         )
@@ -142,12 +151,12 @@ Which = Literal["first", "grasp"]
 """The first-ranked grasp of an episode, or the executed one; a row's columns begin so."""
 
 
-def known_grasps(rows: Iterable[Row], reading: Reading) -> Iterator[tuple[Row, Which, bool]]:
-    """Yield each grasp whose outcome is known: its row, which of the row's grasps it is, and whether it worked.
+def labelled_grasps(rows: Iterable[Row], reading: Reading) -> Iterator[tuple[Row, Which, bool]]:
+    """Yield each grasp with a known outcome: its row, its column prefix, and whether it succeeded.
 
-    An executed grasp worked if its episode did. Under `top1` a first-ranked grasp that was passed over, since the arm
-    could not do it, is one that did not work; under `fallthrough` passing it over costs nothing, so it is left out.
-    Methods that chose the same grasp give one. Rows with retries are passed over: they tell of the last attempt.
+    An executed grasp has the outcome of its episode. Under `top1` a first-ranked grasp that was rejected as unreachable
+    is a failure; under `fallthrough` its rejection costs nothing, so it is left out. Methods that chose the same grasp
+    give one. Rows with retries are left out: they describe the last attempt.
     """
     found: set[tuple[str, int | None]] = set()
     for row in rows:
@@ -162,15 +171,14 @@ def known_grasps(rows: Iterable[Row], reading: Reading) -> Iterator[tuple[Row, W
             yield row, "grasp", bool(row["success"])
 
 
-def samples_of(rows: Iterable[Row], reading: Reading) -> Samples:
-    """Return the known grasps of `rows` with what was measured of them; rows of earlier versions have no such columns
-    and are passed over."""
-    known = [(row, _features(row, which), right) for row, which, right in known_grasps(rows, reading)]
-    known = [(row, measured, right) for row, measured, right in known if measured is not None]
+def extract_samples(rows: Iterable[Row], reading: Reading) -> Samples:
+    """Return the labelled grasps of `rows` with their features; rows of earlier versions have none and are left out."""
+    known = [(row, _features(row, which), succeeded) for row, which, succeeded in labelled_grasps(rows, reading)]
+    known = [(row, features, succeeded) for row, features, succeeded in known if features is not None]
     return Samples(
-        measured=np.array([measured for _, measured, _ in known], dtype=float).reshape(-1, len(FEATURES)),
-        worked=np.array([right for *_, right in known], dtype=bool),
-        poses=np.array([pose_of(row) for row, *_ in known], dtype=str),
+        features=np.array([features for _, features, _ in known], dtype=float).reshape(-1, len(FEATURES)),
+        success=np.array([succeeded for *_, succeeded in known], dtype=bool),
+        poses=np.array([scenario_pose(row) for row, *_ in known], dtype=str),
         objects=np.array([row["object"] for row, *_ in known], dtype=str),
     )
 

@@ -1,4 +1,4 @@
-"""Ways to grasp an object in a scene that is known exactly, and which of them to try next."""
+"""Reachable grasps of an object in an exactly known scene, and the order to try them in."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from z1_runtime.types import GraspPlan, Observation, Plane, Rejection, Rejection
 EXACT_PLANNER = PlannerConfig(
     short_standoff_m=0.04,
     max_branches=8,
-    # The jaws' rubber has a friction of 1.0 in the twin, and no side of the object is unseen
+    # The jaws' rubber has a friction of 1.0 in the twin, and no side of the object is occluded
     gripper=BeakConfig(unseen_m=0.0, friction=0.8),
     collision=CollisionConfig(
         scene_threshold_m=0.001,
@@ -48,79 +48,85 @@ EXACT_PLANNER = PlannerConfig(
         object_halo_m=0.0,
     ),
 )
-"""The planner's numbers without what they allow for noise, unseen sides and the camera's calibration."""
+"""The planner's numbers without margins for noise, occluded sides and the camera's calibration."""
 
 _SPACING_M = 0.002
-_ALIKE_RAD, _ALIKE_M = 0.5, 0.03
-"""Ways that differ by this much in direction, or in place, are alike by 0.6."""
-_A_COPY = 0.95
+_SIMILAR_RAD, _SIMILAR_M = 0.5, 0.03
+"""Difference in direction, or in place, at which two grasps have a similarity of 0.6."""
+_DUPLICATE_SIMILARITY = 0.95
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Option:
-    """One grasp, one flip, that the arm can go."""
+class ReachableGrasp:
+    """One grasp, one flip, that the arm can reach."""
 
-    way: GripperPlacement
+    placement: GripperPlacement
 
 
-class Options:
-    """Ways of one scene; hands out the best of those least like what failed.
+class GraspQueue:
+    """Reachable grasps of one scene, ordered by value and by dissimilarity to the failed ones.
 
     Args:
-        options: what can be gone.
-        worth: (N,) how well each should hold, in [0, 1].
-        n_candidates: grasps they were found among.
-        n_clear: those of them with room for the gripper.
-        rejected: why the others are out, by reason.
+        options: the reachable grasps.
+        worth: (N,) expected quality of each, in [0, 1].
+        n_candidates: grasps of the sweep.
+        n_clear: those of them with clearance for the gripper.
+        rejected: rejections of the others, by reason.
     """
 
     def __init__(
-        self, options: list[Option], worth: np.ndarray, *, n_candidates: int, n_clear: int, rejected: Counter[str]
+        self,
+        find_grasps: list[ReachableGrasp],
+        value: np.ndarray,
+        *,
+        n_candidates: int,
+        n_clear: int,
+        rejected: Counter[str],
     ) -> None:
-        self._options, self._worth = options, worth
+        self._grasps, self._value = find_grasps, value
         self.n_candidates, self.n_clear, self.rejected = n_candidates, n_clear, rejected
-        self._traits = np.array([_traits(option.way) for option in options]).reshape(-1, 9)
-        self._hope, self._nearest = np.ones(len(options)), np.zeros(len(options))
+        self._descriptor = np.array([_descriptor(grasp.placement) for grasp in find_grasps]).reshape(-1, 9)
+        self._novelty, self._nearest = np.ones(len(find_grasps)), np.zeros(len(find_grasps))
         self._failed: list[np.ndarray] = []
 
     def __len__(self) -> int:
-        return len(self._options)
+        return len(self._grasps)
 
-    def next(self) -> Option | None:
-        """Return the one to try next, or None when all that is left are copies of what failed."""
-        value = np.where(self._nearest < _A_COPY, self._worth + self._hope, -np.inf)
+    def next(self) -> ReachableGrasp | None:
+        """Return the next grasp to try, or None when only copies of failed ones remain."""
+        value = np.where(self._nearest < _DUPLICATE_SIMILARITY, self._value + self._novelty, -np.inf)
         if not len(value) or not np.isfinite(value.max()):
             return None
-        return self._options[int(value.argmax())]
+        return self._grasps[int(value.argmax())]
 
-    def fail(self, option: Option) -> None:
-        """Set back `option` and all that is like it."""
-        self._mark(_traits(option.way))
+    def add_failure(self, grasp: ReachableGrasp) -> None:
+        """Lower the value of `grasp` and of similar ones."""
+        self._add_failure(_descriptor(grasp.placement))
 
-    def joined(self, others: Options) -> Options:
-        """Return `others` with the failures known here."""
+    def with_failures(self, others: GraspQueue) -> GraspQueue:
+        """Return `others` with the failures of this queue."""
         for traits in self._failed:
-            others._mark(traits)
+            others._add_failure(traits)
         return others
 
-    def _mark(self, traits: np.ndarray) -> None:
+    def _add_failure(self, traits: np.ndarray) -> None:
         self._failed.append(traits)
-        apart = self._traits - traits
-        turned = np.sum(apart[:, :6] ** 2, axis=1) / _ALIKE_RAD**2
-        moved = np.sum(apart[:, 6:] ** 2, axis=1) / _ALIKE_M**2
-        alike = np.exp(-0.5 * (turned + moved))
-        self._nearest = np.maximum(self._nearest, alike)
-        self._hope *= 1.0 - alike
+        difference = self._descriptor - traits
+        turned = np.sum(difference[:, :6] ** 2, axis=1) / _SIMILAR_RAD**2
+        moved = np.sum(difference[:, 6:] ** 2, axis=1) / _SIMILAR_M**2
+        similarity = np.exp(-0.5 * (turned + moved))
+        self._nearest = np.maximum(self._nearest, similarity)
+        self._novelty *= 1.0 - similarity
 
 
-def _traits(way: GripperPlacement) -> np.ndarray:
-    """Return what makes a way another: approach, the jaws' axis, and where the pads press (9,)."""
-    T = way.T_base_grasp
-    return np.concatenate([T[:3, 2], way.T_base_pivot[:3, 1], T[:3, 3]])
+def _descriptor(placement: GripperPlacement) -> np.ndarray:
+    """Return the descriptor (9,) of a placement: approach, the jaws' axis, and the place of the pads."""
+    T = placement.T_base_grasp
+    return np.concatenate([T[:3, 2], placement.T_base_pivot[:3, 1], T[:3, 3]])
 
 
-class TrueScene:
-    """What stands in a scene, as the planner's checks want it: whole surfaces in the base frame, without noise.
+class GroundTruthScene:
+    """Exact scene for the planner's checks: whole surfaces in the base frame, without noise.
 
     Args:
         scene: the twin's.
@@ -134,7 +140,7 @@ class TrueScene:
         width_estimation.warm_up()
         self.kinematics = kinematics
         self._planner = planner
-        self._surface, self._T_base_object = Surface(scene.thing), scene.T_base_object()
+        self._surface, self._T_base_object = Surface(scene.grasp_object), scene.T_base_object()
         self._middle = self._T_base_object[:3, 3]
         self._gripper = BeakGripper(planner.gripper)
         q_home = np.append(z1.Q_HOME, GRIPPER_START_RAD)
@@ -149,8 +155,8 @@ class TrueScene:
             timer=lambda _: nullcontext(),
         )
 
-    def options(self, sweep: SweepConfig) -> Options:
-        """Return the ways that hit nothing and that the arm can go, of the grasps of `sweep`."""
+    def find_grasps(self, sweep: SweepConfig) -> GraspQueue:
+        """Return the collision-free grasps of `sweep` that the arm can reach."""
         planner = self._planner
         grasps = sweep_grasps(self._surface, self._T_base_object, planner.gripper.contact_depth_m, sweep)
         candidates = GraspCandidates.from_grasps(
@@ -165,30 +171,30 @@ class TrueScene:
                 rejected[placed.rejection.reason] += 1
                 continue
             n_clear += 1
-            gone = [(way, score) for way in placed.placements if (score := ranker.manipulability(way))]
-            rejected[RejectionReason.IK] += not gone
-            for way, score in gone:
-                found.append(Option(way=way))
+            reachable = [(p, score) for p in placed.placements if (score := ranker.manipulability(p))]
+            rejected[RejectionReason.IK] += not reachable
+            for placement, score in reachable:
+                found.append(ReachableGrasp(placement=placement))
                 ranks.append(rank)
                 scores.append(score)
-        worth = ranker.quality(candidates, self._middle, np.zeros(len(grasps)))
-        return Options(
+        value = ranker.quality(candidates, self._middle, np.zeros(len(grasps)))
+        return GraspQueue(
             found,
-            worth[np.array(ranks, dtype=int)] + planner.reachability.manipulability * np.array(scores),
+            value[np.array(ranks, dtype=int)] + planner.reachability.manipulability * np.array(scores),
             n_candidates=len(grasps),
             n_clear=n_clear,
             rejected=rejected,
         )
 
-    def plan(self, option: Option) -> GraspPlan | Rejection:
-        """Return the whole motion of `option`, or the rejection of it."""
-        motion = self._motions.plan_first([option.way])
+    def plan(self, grasp: ReachableGrasp) -> GraspPlan | Rejection:
+        """Return the whole motion of `grasp`, or its rejection."""
+        motion = self._motions.plan_first([grasp.placement])
         return motion if isinstance(motion, Rejection) else make_plan(motion)
 
     def _observation(self, scene: SceneConfig) -> Observation:
-        """Return the scene as if it had been seen from all sides at once; its camera frame is the base frame."""
+        """Return an observation from all sides at once; its camera frame is the base frame."""
         others = [
-            transform_points(neighbour.T_base_object(), _even_points(Surface(OBJECTS[neighbour.object])))
+            transform_points(neighbour.T_base_object(), _sample_evenly(Surface(OBJECTS[neighbour.object])))
             for neighbour in scene.neighbours
         ]
         nothing = RgbdFrame(
@@ -202,13 +208,13 @@ class TrueScene:
             frame=nothing,
             T_base_camera=np.eye(4),
             detection=Detection(label=scene.object, confidence=1.0, box_px=(0, 0, 1, 1)),
-            object_points=transform_points(self._T_base_object, _even_points(self._surface)),
+            object_points=transform_points(self._T_base_object, _sample_evenly(self._surface)),
             scene_points=np.concatenate([np.zeros((0, 3)), *others]),
             table=Plane(normal=np.array([0.0, 0.0, 1.0]), offset_m=0.0),
         )
 
 
-def _even_points(surface: Surface) -> np.ndarray:
+def _sample_evenly(surface: Surface) -> np.ndarray:
     """Return points (N, 3) about 2 mm apart all over `surface`, in its own frame [m]."""
     points = surface.sample(0.5 * _SPACING_M).points
     _, first = np.unique(np.floor(points / _SPACING_M).astype(int), axis=0, return_index=True)
