@@ -232,7 +232,7 @@ def make_rig(scene: SceneConfig | None = None, lockstep: bool = False, **fields:
     """Return arm, camera and clock of one new world, not yet connected.
 
     Args:
-        scene: what stands on the table; None builds it from `fields`.
+        scene: objects on the table; None builds it from `fields`.
         lockstep: True for the twin's own clock, False for the wall's.
         **fields: of a `SceneConfig`, for callers that do not import the twin.
     """

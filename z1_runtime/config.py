@@ -22,23 +22,23 @@ from z1_runtime.planning.planner_config import PlannerConfig
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RuntimeConfig:
-    """How a pick is done."""
+    """Settings of a pick."""
 
     detector: str = "yolo"
-    """Which detector: `yolo` (the learned one that ships: bottles, boxes and cylinders), `tabletop` (whatever rises
-    above the table, no learning), or `truth` (the twin's mask, for evaluation)."""
+    """Detector: `yolo` (the learned one that ships: bottles, boxes and cylinders), `tabletop` (whatever rises
+    above the table, no learning), or `ground_truth` (the twin's mask, for evaluation)."""
     detector_weights: str = ""
     """Weights of `yolo`: .npz of ours, .pt of ultralytics, .onnx, OpenVINO's .xml or its folder; empty = ours."""
     detector_runtime: str = "auto"
-    """What runs `yolo`: `openvino`, `onnxruntime`, `torch`, or `auto`, the first of these that is installed."""
+    """Inference runtime of `yolo`: `openvino`, `onnxruntime`, `torch`, or `auto`, the first of these that is installed."""
     detector_confidence: float = 0.5
-    """What `yolo` is not surer of than this does not count, in [0, 1)."""
+    """Minimum detection confidence of `yolo`, in [0, 1)."""
     detector_mirrored: bool = True
-    """Whether `yolo` looks at the mirror image as well: fewer errors for twice the time."""
+    """Whether `yolo` also runs on the mirror image: fewer errors for twice the time."""
     object_class: str = ""
-    """The class to pick, for a detector that knows classes; empty = whatever it is surest of."""
+    """Class to pick, for a detector with classes; empty = the most confident detection."""
     generator: str = "diffusion"
-    """Which grasp generator: `diffusion` (learned, for any parallel jaw) and `diffusion_z1` (for the Z1's beak) ship;
+    """Grasp generator: `diffusion` (learned, for any parallel jaw) and `diffusion_z1` (for the Z1's gripper) ship;
     `antipodal`, `obb_sweep` (no learning), `graspgen`, `graspgenx` (NVIDIA's; weights are yours to bring), or
     `union:a+b` of any of them."""
     generator_weights: str = ""
@@ -52,35 +52,35 @@ class RuntimeConfig:
     seed: int = 0
     """Seed of the generator."""
     box_method: Literal["upright", "pca", "min_volume"] = "upright"
-    """How the box is fitted; `pca` is the paper's, `upright` is right where gravity is known."""
+    """Box fit: `pca` is the paper's, `upright` uses the known direction of gravity."""
     k_faces: int = 2
-    """How many faces nearest to the camera a grasp may approach (the paper's k)."""
+    """Number of faces nearest to the camera that a grasp may approach (the paper's k)."""
     alpha: float = 0.85
-    """Weight of the alignment against the generator's score (the paper's α), among grasps that are worth the same to
-    arm and gripper (`planner.reachability`)."""
+    """Weight of the alignment against the generator's score (the paper's α), among grasps of equal value to arm
+    and gripper (`planner.reachability`)."""
     scoring: str = ""
-    """A file of `./z1 tune`, whose box, faces, weights and thresholds then stand for `box_method`, `k_faces`, `alpha`
-    and, if it holds a head, for the weights of `planner.reachability`; empty = those set here."""
+    """A file of `./z1 tune`, whose box, faces, weights and thresholds replace `box_method`, `k_faces`, `alpha`
+    and, if it has a head, the weights of `planner.reachability`; empty = those set here."""
     speed: float = 0.5
     """Fraction of the arm's speed, acceleration and jerk limits that motions use, in (0, 1]."""
     jaw_home: float = -1.0
-    """Mover angle while looking [rad]; 0 is closed."""
+    """Jaw angle in the observation posture [rad]; 0 is closed."""
     jaw_empty: float = -0.03
-    """A mover that closes beyond this angle holds nothing [rad]."""
+    """Jaw angle beyond which a closed gripper is empty [rad]."""
     held_torque_nm: float = 1.0
-    """A gripper torque below this holds nothing [Nm]."""
+    """Minimum gripper torque of a held object [Nm]."""
     hold_s: float = 1.0
-    """How long the lifted object is held before it counts [s]."""
+    """Duration for which the lifted object must be held [s]."""
     attempts: int = 2
-    """How often to pick while the jaws end up empty, each time from the scene as it then is."""
+    """Maximum number of picks while the jaws end up empty, each from a new frame."""
     frame_timeout_s: float = 5.0
-    """How long to wait for a camera frame [s]."""
+    """Timeout of a camera frame [s]."""
     perception: PerceptionConfig = field(default_factory=PerceptionConfig)
     """Clouds, filters and the table."""
     planner: PlannerConfig = field(default_factory=PlannerConfig)
     """Stand-off, lift, clearances."""
     executor: ExecutorConfig = field(default_factory=ExecutorConfig)
-    """How trajectories are handed to the servo."""
+    """Streaming of trajectories to the servo."""
 
     def __post_init__(self) -> None:
         _require(self.detector in DETECTORS, "detector", repr(self.detector), " or ".join(DETECTORS))

@@ -33,7 +33,7 @@ class RemoteArm:
 
     Args:
         config: address of the HAL process.
-        owner: name of this client; a random suffix tells two of the same name apart.
+        owner: name of this client; a random suffix distinguishes two of the same name.
         clock: the wall clock.
     """
 

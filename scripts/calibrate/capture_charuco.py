@@ -85,7 +85,7 @@ def capture(config: Config, console: Console, read_key: Callable[[], Key] | None
         robot = undo.enter_context(open_robot(config.robot, config.board, config.seed))
         devices = {"arm": robot.arm, "camera": robot.camera, "clock": robot.clock, "board": config.board}
         session = SampleCapture(**devices, folder=folder, inspector=inspector)
-        n_before = session.open(now(), twin_ground_truth(robot.truth))
+        n_before = session.open(now(), twin_ground_truth(robot.ground_truth))
         console.print(
             f"samples go to {folder}" + (f", which has {n_before} already" if n_before else ""), soft_wrap=True
         )

@@ -97,8 +97,8 @@ def _offset_mm(measurement: TipMeasurement, config: Config, robot: CalibrationRo
 
     The twin's is from its ground truth; of a real arm the operator types the first two, or nothing to skip the corner.
     """
-    if robot.truth is not None:
-        T_base_board = robot.truth().T_base_board
+    if robot.ground_truth is not None:
+        T_base_board = robot.ground_truth().T_base_board
         assert T_base_board is not None
         p_board_tip = transform_points(inverse(T_base_board), measurement.p_base_tip)
         offset = p_board_tip - config.board.corners_m[measurement.corner]

@@ -21,7 +21,7 @@ from hal.base import z1
 from scripts.docs.wrist_overlay import Layers, draw_caption, draw_mask, draw_overlay
 from sim_twin.backends import make_rig
 from sim_twin.camera import d405
-from sim_twin.camera.external_view import draw_outside
+from sim_twin.camera.external_view import render_external
 from sim_twin.camera.render import make_renderer
 from sim_twin.clock import TwinClock
 from sim_twin.model.scene import SceneConfig, build_model
@@ -113,7 +113,7 @@ def draw_frames(scene: SceneConfig, result: PickResult, snapshots: Sequence[Snap
         for number, snapshot in enumerate(snapshots):
             data.qpos[:] = snapshot.qpos
             mujoco.mj_forward(model, data)
-            outside = draw_outside(model, data, *_SIZE)
+            outside = render_external(model, data, *_SIZE)
             if snapshot.t_s >= transfer_s and snapshots[number - 1].t_s < transfer_s:
                 frames += _decision_frames(outside, result)
             colour = d405.measure_colour(renderer.render(data).colour, scene.seed, number)

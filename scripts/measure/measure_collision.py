@@ -75,7 +75,7 @@ def main(config: Config) -> None:
     points = make_scene(config.n_points, rng)
     T = make_poses(config.n_candidates, rng)
     shape = gripper_shape()
-    vertices = np.concatenate([shape.fixed, shape.mover])
+    vertices = np.concatenate([shape.fixed, shape.moving_jaw])
     index, tree = SceneIndex(points), cKDTree(points)
     free = T.copy()
     free[:, 2, 3] += 0.5

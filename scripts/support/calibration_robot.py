@@ -52,8 +52,8 @@ class CalibrationRobot:
     arm: ServoedArm
     camera: Camera
     clock: Clock
-    truth: Callable[[], GroundTruth] | None
-    """Ground truth of the scene; None for a real robot."""
+    ground_truth: Callable[[], GroundTruth] | None
+    """Ground ground_truth of the scene; None for a real robot."""
 
 
 @contextmanager
@@ -75,11 +75,11 @@ def open_robot(options: RobotOptions, board: Board, seed: int) -> Iterator[Calib
             from sim_twin.ground_truth import read_ground_truth
 
             devices = stack.enter_context(connect_rig(make_rig(make_scene(options, board, seed), lockstep=True)))
-            truth: Callable[[], GroundTruth] | None = partial(read_ground_truth, devices.world)
+            ground_truth: Callable[[], GroundTruth] | None = partial(read_ground_truth, devices.world)
         else:
             devices = stack.enter_context(connect_remote(options.bus, "calibrate"))
-            truth = _remote_ground_truth(options.bus, stack)
-        yield CalibrationRobot(arm=devices.arm, camera=devices.camera, clock=devices.clock, truth=truth)
+            ground_truth = _remote_ground_truth(options.bus, stack)
+        yield CalibrationRobot(arm=devices.arm, camera=devices.camera, clock=devices.clock, ground_truth=ground_truth)
 
 
 def _remote_ground_truth(bus: BusConfig, stack: ExitStack) -> Callable[[], GroundTruth] | None:

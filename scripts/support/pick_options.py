@@ -20,7 +20,7 @@ class PickOptions:
     calibration: Path | None = None
     """A hand-eye result; by default the newest of this camera (see `./z1 calibrate`), else the mount's drawing."""
     detector: str | None = None
-    """Overrides the configuration: `tabletop`, `yolo`, or on the twin `truth`, for evaluation."""
+    """Overrides the configuration: `tabletop`, `yolo`, or on the twin `ground_truth`, for evaluation."""
     detector_weights: Path | None = None
     """Weights for `yolo`, which they select: .npz of ours, .pt of ultralytics, .onnx, or OpenVINO's .xml or folder."""
     crop: Literal["mask", "box"] | None = None

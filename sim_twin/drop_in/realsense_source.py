@@ -12,6 +12,7 @@ import numpy as np
 from hal.base.clock import Clock, WallClock
 from hal.base.d405 import BASELINE_M, DEPTH_UNIT_M, MIN_Z_M, CaptureRequest, D405Calibration, Exposure
 from hal.base.messages import Intrinsics
+from sim_twin.backends import lower_thread_priority
 from sim_twin.camera import d405
 from sim_twin.camera.render import make_renderer
 from sim_twin.camera.wrist_view import View, WristRenderer, camera_id

@@ -27,7 +27,7 @@ def test_time_is_a_whole_number_of_periods_however_it_was_slept() -> None:
     assert clock.now_s() == 300 * CONTROL_PERIOD_S
 
 
-def test_a_tick_function_that_sleeps_is_told_off() -> None:
+def test_a_tick_function_that_sleeps_is_rejected() -> None:
     clock = TwinClock(World(SceneConfig(object="cylinder")))
     clock.call_every_tick(lambda: clock.sleep_until(1.0))
     with pytest.raises(RuntimeError):

@@ -1,4 +1,4 @@
-"""What the twin tells its evaluators, over a real link."""
+"""The ground truth service over a real link."""
 
 import socket
 import subprocess

@@ -97,11 +97,11 @@ def gripper_depth(jaw: float) -> np.ndarray:
     import trimesh
 
     T_camera_pivot = np.linalg.inv(T_FLANGE_CAMERA) @ T_FLANGE_PIVOT
-    T_pivot_stator, T_pivot_mover = np.eye(4), np.eye(4)
-    T_pivot_stator[0, 3] = -0.049
-    T_pivot_mover[:3, :3] = cv2.Rodrigues(np.array([0.0, jaw, 0.0]))[0]
+    T_pivot_stationary_jaw, T_pivot_moving_jaw = np.eye(4), np.eye(4)
+    T_pivot_stationary_jaw[0, 3] = -0.049
+    T_pivot_moving_jaw[:3, :3] = cv2.Rodrigues(np.array([0.0, jaw, 0.0]))[0]
     depth = np.full((INTRINSICS.height, INTRINSICS.width), np.inf)
-    for name, T in (("z1_GripperStator", T_pivot_stator), ("z1_GripperMover", T_pivot_mover)):
+    for name, T in (("z1_GripperStator", T_pivot_stationary_jaw), ("z1_GripperMover", T_pivot_moving_jaw)):
         mesh = trimesh.load_mesh(mesh_dir() / "collision" / f"{name}.STL")
         points = trimesh.sample.sample_surface(mesh, 400_000, seed=0)[0]
         x, y, z = (T_camera_pivot @ T @ np.column_stack([points, np.ones(len(points))]).T)[:3]

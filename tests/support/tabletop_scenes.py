@@ -11,7 +11,7 @@ from models.types import Detection, GraspSet
 from z1_runtime.collision.collision_config import CollisionConfig
 from z1_runtime.collision.planning_scene import PlanningScene
 from z1_runtime.collision.scene_collision import CollisionChecker
-from z1_runtime.geometry.gripper_geometry import BeakConfig
+from z1_runtime.geometry.gripper_geometry import GripperPlacementConfig
 from z1_runtime.geometry.kinematics import Kinematics
 from z1_runtime.grasping.beak_gripper import BeakGripper
 from z1_runtime.grasping.grasp_candidates import EARLY_EXIT_CHUNK, GraspCandidates
@@ -76,7 +76,7 @@ def frontal(x: float, y: float, z: float, pitch_rad: float, yaw_rad: float | Non
     opening = np.array([-np.sin(yaw), np.cos(yaw), 0.0])
     T = np.eye(4)
     T[:3, :3] = np.column_stack([np.cross(opening, approach), opening, approach])
-    T[:3, 3] = np.array([x, y, z]) + BeakConfig().contact_depth_m * approach
+    T[:3, 3] = np.array([x, y, z]) + GripperPlacementConfig().contact_depth_m * approach
     return T
 
 

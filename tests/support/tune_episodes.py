@@ -27,7 +27,7 @@ def number_of(method: str) -> int:
 
 
 def episode(scenario: Scenario, method: str, success: bool, *, candidate: int = 0, rank: int = 0, **more) -> Row:
-    """Return a row; what is measured is drawn, but `down` tells whether the executed grasp worked."""
+    """Return a row with random features, of which `down` alone determines the success of the executed grasp."""
     rng = np.random.default_rng([scenario.draw_seed, number_of(method)])
     measured = dict(zip(FEATURES, rng.uniform(0.2, 0.8, len(FEATURES)), strict=True))
     grasp = measured | {"down": rng.normal(0.3 if success else 0.7, 0.1)}

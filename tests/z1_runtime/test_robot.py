@@ -30,7 +30,7 @@ from z1_runtime import Robot
 from z1_runtime.config import RuntimeConfig
 from z1_runtime.devices import Devices, connect_rig
 from z1_runtime.geometry.kinematics import IkFailure, Kinematics
-from z1_runtime.perception.detectors import GroundTruthDetector
+from z1_runtime.perception.detectors.ground_truth import GroundTruthDetector
 
 
 def lockstep_rig() -> Rig:

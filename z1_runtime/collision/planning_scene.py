@@ -112,4 +112,4 @@ def _gripper_points(kinematics: Kinematics, q: np.ndarray) -> np.ndarray:
     shape = gripper_shape()
     T_base_pivot = kinematics.pivot(q[: z1.N_ARM])
     T_base_jaw = T_base_pivot @ moving_jaw_pose(float(q[-1]))
-    return np.concatenate([transform_points(T_base_pivot, shape.fixed), transform_points(T_base_jaw, shape.mover)])
+    return np.concatenate([transform_points(T_base_pivot, shape.fixed), transform_points(T_base_jaw, shape.moving_jaw)])

@@ -79,7 +79,7 @@ class CollisionChecker:
         scene_m = config.scene_threshold_m if scene_threshold_m is None else scene_threshold_m
         object_m = config.object_threshold_m if object_threshold_m is None else object_threshold_m
         T_base_jaws = T_base_pivots @ moving_jaw_pose(jaws)
-        parts = ((T_base_pivots, self._shape.fixed), (T_base_jaws, self._shape.mover))
+        parts = ((T_base_pivots, self._shape.fixed), (T_base_jaws, self._shape.moving_jaw))
         height = np.min([self._lowest(T, vertices) for T, vertices in parts], axis=0)
         clear = height >= config.table_margin_m
         scene = self._hits(self.scene.scene_index, parts, scene_m, clear)
@@ -149,7 +149,7 @@ class CollisionChecker:
         return None
 
     def _heights(self, T_base_pivots: np.ndarray, jaws: np.ndarray) -> np.ndarray:
-        parts = ((T_base_pivots, self._shape.fixed), (T_base_pivots @ moving_jaw_pose(jaws), self._shape.mover))
+        parts = ((T_base_pivots, self._shape.fixed), (T_base_pivots @ moving_jaw_pose(jaws), self._shape.moving_jaw))
         return np.min([self._lowest(T, vertices) for T, vertices in parts], axis=0)
 
     def _lowest(self, T: np.ndarray, vertices: np.ndarray) -> np.ndarray:

@@ -72,7 +72,7 @@ def check_arm(poses: ArmPoses, table: Plane, link_margin_m: float, stage: Planni
         return Rejection(reason=RejectionReason.SELF, stage=stage, detail=detail)
     obstacles = np.ascontiguousarray(ends[:, _OBSTACLES])
     shape = gripper_shape()
-    parts = (("gripper or camera", poses.pivots, shape.fixed), ("the moving jaw", poses.jaws, shape.mover))
+    parts = (("gripper or camera", poses.pivots, shape.fixed), ("the moving jaw", poses.jaws, shape.moving_jaw))
     for part, T, vertices in parts:
         c = _first_capsule_hit(T, vertices[:_SELF_VERTICES], obstacles, _RADII[_OBSTACLES])
         if c >= 0:

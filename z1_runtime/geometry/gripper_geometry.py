@@ -24,7 +24,7 @@ _MAX_PAST_RATIO = 0.15  # of an object's radius: beyond it, a thin object would 
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class BeakConfig:
+class GripperPlacementConfig:
     """Placement of the gripper around an object."""
 
     contact_depth_m: float = 0.012
@@ -34,7 +34,7 @@ class BeakConfig:
     """Distance of the knees beyond the contact axis along the approach; a little beyond pulls the object in [m]."""
     max_setback_m: float = 0.025
     """Maximum distance before the requested contacts at which an object that reaches the palm is held instead [m]."""
-    unseen_m: float = 0.004
+    occluded_margin_m: float = 0.004
     """Margin added to contacts on the occluded side: generators underestimate what the camera cannot see [m]."""
     max_deepening_m: float = 0.010
     """Maximum distance beyond the requested contacts at which an object is held that reaches less far towards the palm
@@ -50,7 +50,7 @@ class BeakConfig:
     """Minimum friction coefficient that must hold the object against the wedge; rubber on plastic has 0.5 to 1."""
 
 
-class Lay(NamedTuple):
+class JawFit(NamedTuple):
     """The jaws around N discs, in the pivot's xz plane."""
 
     contact: np.ndarray
@@ -71,7 +71,7 @@ class Lay(NamedTuple):
     """(N,) distance of the disc before the contact axis, so that the palm stays clear of the object [m]."""
 
 
-def lay_around(widths: np.ndarray, fronts: np.ndarray, config: BeakConfig) -> Lay:
+def fit_jaws(widths: np.ndarray, fronts: np.ndarray, config: GripperPlacementConfig) -> JawFit:
     """Return the jaws around discs of `widths` (N,) that reach `fronts` (N,) towards the palm [m]."""
     r = 0.5 * widths
     knees = np.sqrt(np.maximum(KNEE_RADIUS_M**2 - r**2, 0.0)) - np.minimum(config.knee_past_m, _MAX_PAST_RATIO * r)
@@ -87,7 +87,7 @@ def lay_around(widths: np.ndarray, fronts: np.ndarray, config: BeakConfig) -> La
     push = np.sum((2.0 * centre - on_stationary - on_moving) * along, axis=1)
     above_open, opened = _gap(distance, r + config.clearance_m)
     above_pressed, pressed = _gap(distance, np.maximum(r - 0.5 * config.squeeze_m, 0.0))
-    return Lay(
+    return JawFit(
         contact=contact,
         opened=opened,
         pressed=pressed,
@@ -110,7 +110,7 @@ def _gap(distance: np.ndarray, r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _bearing(face, distance, r, side):
     """Return the angles (N,) [rad] of discs' centres, at `distance` (N,) from the axis, that just touch `face`.
 
-    `side` is +1 when the disc lies above the face, −1 below. The gap grows with the angle: bisection finds it.
+    `side` is +1 for a disc above the face, −1 below. The gap grows with the angle: bisection finds it.
     """
     on_face = np.arctan2(face[1, 1], face[1, 0])
     bearings = np.empty(len(r))

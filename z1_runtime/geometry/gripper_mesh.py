@@ -21,11 +21,11 @@ class GripperShape:
 
     fixed: np.ndarray
     """(V, 3) wrist, stationary jaw, camera and bracket, in the pivot frame [m]."""
-    mover: np.ndarray
+    moving_jaw: np.ndarray
     """(V, 3) moving jaw, in its own frame: the pivot frame at jaw angle 0 [m]."""
 
     def __len__(self) -> int:
-        return len(self.fixed) + len(self.mover)
+        return len(self.fixed) + len(self.moving_jaw)
 
 
 @cache
@@ -43,10 +43,10 @@ def gripper_shape(spacing_m: float = _SPACING_M) -> GripperShape:
     )
     bracket = transform_points(T_pivot_flange, _bracket(spacing_m))
     fixed = np.concatenate([stator[~inside], wrist, camera, bracket])
-    mover = _mesh_surface("z1_GripperMover", _JAW_SPACING_M)
-    shape = GripperShape(fixed=spread_first(fixed), mover=spread_first(mover))
+    moving_jaw = _mesh_surface("z1_GripperMover", _JAW_SPACING_M)
+    shape = GripperShape(fixed=spread_first(fixed), moving_jaw=spread_first(moving_jaw))
     shape.fixed.setflags(write=False)
-    shape.mover.setflags(write=False)
+    shape.moving_jaw.setflags(write=False)
     return shape
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from hal.base import z1
 from hal.base.errors import Z1Error
 from hal.base.z1_gripper import moving_jaw_pose
-from z1_runtime.geometry.gripper_geometry import BeakConfig, Lay, lay_around
+from z1_runtime.geometry.gripper_geometry import GripperPlacementConfig, JawFit, fit_jaws
 from z1_runtime.types import PlanningStage, Rejection, RejectionReason
 
 _WIDTHS_M = np.arange(0.002, 0.120, 0.0005)
@@ -72,17 +72,17 @@ class GripperFits:
 class BeakGripper:
     """Fits the gripper to objects of given width; independent of arm and scene."""
 
-    def __init__(self, config: BeakConfig | None = None) -> None:
-        self.config = config or BeakConfig()
+    def __init__(self, config: GripperPlacementConfig | None = None) -> None:
+        self.config = config or GripperPlacementConfig()
         self._max_squeeze_out = float(np.arctan(self.config.friction))
-        fits = self._is_feasible(lay_around(_WIDTHS_M, 0.5 * _WIDTHS_M, self.config))
+        fits = self._is_feasible(fit_jaws(_WIDTHS_M, 0.5 * _WIDTHS_M, self.config))
         self.max_width_m = float(_WIDTHS_M[fits].max(initial=0.0))
         """Widest round object that is neither squeezed out nor needs more than the full opening [m]."""
 
     def squeeze_out_angle(self, width_m: float) -> float:
         """Return the angle [rad] that friction has to hold at each jaw; negative when the squeeze pulls inwards."""
         width = np.array([width_m])
-        return float(lay_around(width, 0.5 * width, self.config).squeeze_out[0])
+        return float(fit_jaws(width, 0.5 * width, self.config).squeeze_out[0])
 
     def fit(
         self, T_base_grasp: np.ndarray, width_m: float, front_m: float | None = None
@@ -129,25 +129,25 @@ class BeakGripper:
         usable = (widths_m > 0.0) & (widths_m < _WIDTHS_M[-1])
         widths = np.where(usable, widths_m, _PLACEHOLDER_WIDTH_M)
         fronts = 0.5 * widths if fronts_m is None else fronts_m
-        lay = lay_around(widths, fronts, self.config)
-        T_grasp_pivot = _grasp_to_pivot(lay.centre, lay.tilt)
-        T_grasp_pivot[:, 2, 3] -= self.config.contact_depth_m + lay.setback_m
+        jaw_fit = fit_jaws(widths, fronts, self.config)
+        T_grasp_pivot = _grasp_to_pivot(jaw_fit.centre, jaw_fit.tilt)
+        T_grasp_pivot[:, 2, 3] -= self.config.contact_depth_m + jaw_fit.setback_m
         flip = np.diag([-1.0, -1.0, 1.0, 1.0])
         T_base_pivots = np.stack([T_base_grasps @ T_grasp_pivot, T_base_grasps @ flip @ T_grasp_pivot], axis=1)
         return GripperFits(
             T_base_pivots=T_base_pivots,
-            jaw_contact=_clip_jaw(-lay.contact),
-            jaw_open=_clip_jaw(-lay.opened),
-            T_base_touches=T_base_pivots @ moving_jaw_pose(-lay.turn)[:, None],
-            jaw_touch=_clip_jaw(-lay.pressed),
-            setback_m=lay.setback_m,
-            level=np.clip(1.0 - lay.squeeze_out / self._max_squeeze_out, 0.0, 1.0),
-            fits=usable & self._is_feasible(lay),
+            jaw_contact=_clip_jaw(-jaw_fit.contact),
+            jaw_open=_clip_jaw(-jaw_fit.opened),
+            T_base_touches=T_base_pivots @ moving_jaw_pose(-jaw_fit.turn)[:, None],
+            jaw_touch=_clip_jaw(-jaw_fit.pressed),
+            setback_m=jaw_fit.setback_m,
+            level=np.clip(1.0 - jaw_fit.squeeze_out / self._max_squeeze_out, 0.0, 1.0),
+            fits=usable & self._is_feasible(jaw_fit),
         )
 
-    def _is_feasible(self, lay: Lay) -> np.ndarray:
-        held = (lay.squeeze_out <= self._max_squeeze_out) & (lay.setback_m <= self.config.max_setback_m)
-        return held & (lay.opened <= -z1.GRIPPER_OPEN)
+    def _is_feasible(self, jaw_fit: JawFit) -> np.ndarray:
+        held = (jaw_fit.squeeze_out <= self._max_squeeze_out) & (jaw_fit.setback_m <= self.config.max_setback_m)
+        return held & (jaw_fit.opened <= -z1.GRIPPER_OPEN)
 
 
 def make_placement(fits: GripperFits, n: int, flip: int, T_base_grasp: np.ndarray, width_m: float) -> GripperPlacement:

@@ -94,7 +94,7 @@ class LazyFits:
         """Return grasps (n, 4, 4) moved along y to the middle of the points between their pads, the object's width
         (n,), and its extent towards the palm (n,) [m]; widths `given_m` (n,) may be NaN."""
         config = self.gripper.config
-        estimate = estimate_widths(Ts, given_m, self._shape_points, config.contact_depth_m, config.unseen_m)
+        estimate = estimate_widths(Ts, given_m, self._shape_points, config.contact_depth_m, config.occluded_margin_m)
         widths = np.where(np.isfinite(estimate.widths_m), estimate.widths_m, self._fallback_width_m)
         centred = Ts.copy()
         centred[:, :3, 3] += estimate.shifts_m[:, None] * Ts[:, :3, 1]

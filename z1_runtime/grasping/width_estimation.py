@@ -40,7 +40,7 @@ def estimate_widths(
     widths_m: np.ndarray,
     points: np.ndarray,
     contact_depth_m: float,
-    occlusion_margin_m: float = 0.0,
+    occluded_margin_m: float = 0.0,
 ) -> WidthEstimate:
     """Measure the object's `points` (M, 3) in the frames of grasps (N, 4, 4) with `widths_m` (N,), NaN = not known.
 
@@ -49,10 +49,10 @@ def estimate_widths(
         widths_m: distance between the contacts [m].
         points: in the base frame [m].
         contact_depth_m: distance of the grasps' origins beyond their contacts [m].
-        occlusion_margin_m: added at each contact without an observed point near it [m].
+        occluded_margin_m: added at each contact without an observed point near it [m].
     """
     T, widths, cloud = (np.ascontiguousarray(array, dtype=np.float64) for array in (T_base_grasps, widths_m, points))
-    return WidthEstimate(*_estimate(T, widths, cloud, contact_depth_m, occlusion_margin_m))
+    return WidthEstimate(*_estimate(T, widths, cloud, contact_depth_m, occluded_margin_m))
 
 
 def measure_support(
@@ -96,7 +96,7 @@ def _local(T, p, contact_depth_m):
 
 
 @njit(cache=True)
-def _estimate(T, given, points, contact_depth_m, occlusion_margin_m):  # noqa: PLR0912 - one pass over all points for each grasp
+def _estimate(T, given, points, contact_depth_m, occluded_margin_m):  # noqa: PLR0912 - one pass over all points for each grasp
     n = len(T)
     widths, fronts, shifts = given.copy(), np.zeros(n), np.zeros(n)
     local, between, across = np.empty((len(points), 3)), np.empty(len(points)), np.empty(len(points))
@@ -129,8 +129,8 @@ def _estimate(T, given, points, contact_depth_m, occlusion_margin_m):  # noqa: P
             if abs(moved_m) < _MIN_SHIFT_M:
                 break
         if not np.isnan(low):
-            above = occlusion_margin_m * (high < shift + half - _OBSERVED_M)
-            below = occlusion_margin_m * (low > shift - half + _OBSERVED_M)
+            above = occluded_margin_m * (high < shift + half - _OBSERVED_M)
+            below = occluded_margin_m * (low > shift - half + _OBSERVED_M)
             half += 0.5 * (above + below)
             widths[g], shifts[g] = 2.0 * half, shift + 0.5 * (above - below)
         count = 0

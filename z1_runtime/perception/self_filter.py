@@ -49,7 +49,7 @@ class SelfFilter:
         points = np.concatenate(
             [
                 transform_points(T_camera_pivot, shape.fixed),
-                transform_points(T_camera_pivot @ moving_jaw_pose(jaw), shape.mover),
+                transform_points(T_camera_pivot @ moving_jaw_pose(jaw), shape.moving_jaw),
             ]
         )
         points = points[points[:, 2] > _MIN_DEPTH_M]

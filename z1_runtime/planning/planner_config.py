@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 from hal.base.errors import InvalidValueError
 from z1_runtime.collision.collision_config import CollisionConfig
-from z1_runtime.geometry.gripper_geometry import BeakConfig
+from z1_runtime.geometry.gripper_geometry import GripperPlacementConfig
 from z1_runtime.planning.reachability_config import ReachabilityConfig
 
 
@@ -37,7 +37,7 @@ class PlannerConfig:
     """A joint that turns further than this between pre-grasp and grasp, or grasp and lift, has changed its branch."""
     reachability: ReachabilityConfig = field(default_factory=ReachabilityConfig)
     """Weights that rank the grasps for this arm and gripper."""
-    gripper: BeakConfig = field(default_factory=BeakConfig)
+    gripper: GripperPlacementConfig = field(default_factory=GripperPlacementConfig)
     """Fit of the gripper to an object."""
     collision: CollisionConfig = field(default_factory=CollisionConfig)
     """Distances that count as a collision."""

@@ -21,7 +21,7 @@ from z1_runtime.collision import scene_collision
 from z1_runtime.collision.collision_config import CollisionConfig
 from z1_runtime.collision.planning_scene import PlanningScene
 from z1_runtime.collision.scene_collision import CollisionChecker
-from z1_runtime.geometry.gripper_geometry import BeakConfig
+from z1_runtime.geometry.gripper_geometry import GripperPlacementConfig
 from z1_runtime.geometry.kinematics import Kinematics
 from z1_runtime.grasping import width_estimation
 from z1_runtime.grasping.beak_gripper import BeakGripper, GripperPlacement
@@ -37,7 +37,7 @@ EXACT_PLANNER = PlannerConfig(
     short_standoff_m=0.04,
     max_branches=8,
     # The jaws' rubber has a friction of 1.0 in the twin, and no side of the object is occluded
-    gripper=BeakConfig(unseen_m=0.0, friction=0.8),
+    gripper=GripperPlacementConfig(occluded_margin_m=0.0, friction=0.8),
     collision=CollisionConfig(
         scene_threshold_m=0.001,
         object_threshold_m=0.002,

@@ -123,7 +123,7 @@ class _NoGroundTruth:
     def __enter__(self):
         from dataclasses import replace
 
-        return replace(self._robot.__enter__(), truth=None)
+        return replace(self._robot.__enter__(), ground_truth=None)
 
     def __exit__(self, *error) -> None:
         self._robot.__exit__(*error)

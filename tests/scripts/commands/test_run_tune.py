@@ -46,7 +46,7 @@ def log(tmp_path):
 
 
 def twin(lifts):
-    """Returns what stands for the runner: `lifts` says of a method and the scenario's number whether it succeeds."""
+    """Return a fake runner: `lifts` maps a method and the scenario's number to success."""
 
     def run_tasks(tasks, jobs):
         assert {task.scenario.seed for task in tasks} == {2}

@@ -237,7 +237,7 @@ def test_a_crowd_shows_more_objects(renderer: SceneRenderer) -> None:
 
 
 @needs_egl
-def test_more_of_what_is_no_object_stands_about_when_asked(renderer: SceneRenderer) -> None:
+def test_the_number_of_distractors_can_be_raised(renderer: SceneRenderer) -> None:
     def shown(distractors: float) -> int:
         mix = SceneMix(crowd=0.5, occluded=0.0, distractors=distractors)
         counts = []

@@ -1,4 +1,4 @@
-"""The board on the twin's table: seen where it lies, by either renderer, from as near and as far as it is used."""
+"""The board on the twin's table: rendered at its pose by either renderer, over the whole range of use."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def test_the_pose_is_right_handed_and_its_origin_the_corner_of_the_print():
     assert np.allclose(unturned[:3, :3] @ [0.0, -1.0, 0.0], [1.0, 0.0, 0.0])  # its upper edge is the far one
 
 
-def test_the_board_can_be_touched_and_the_object_stands_out_of_reach(world: World):
+def test_the_board_can_be_touched_and_the_object_is_out_of_reach(world: World):
     assert world.model.geom("board_plate").contype != 0
     assert np.linalg.norm(world.T_base_object()[:2, 3]) > 1.0  # the arm ends at 0.74 m
     truth = read_ground_truth(world)
@@ -97,7 +97,7 @@ def test_a_mount_off_its_drawing_is_off_by_what_was_asked_and_has_a_serial_of_it
 
 
 @needs_egl
-def test_every_frame_tells_the_camera_s_serial_number():
+def test_every_frame_has_the_camera_s_serial_number():
     config = SceneConfig(mount_error_deg=1.0)
     camera = make_rig(config, lockstep=True).camera
     camera.connect()

@@ -22,7 +22,7 @@ def write(path: Path, mesh: trimesh.Trimesh) -> Path:
 
 
 def bracket() -> trimesh.Trimesh:
-    """Return an L of two bars in millimetres, 60 × 40 × 90 mm, which lies well off the origin."""
+    """Return an L of two bars in millimetres, 60 × 40 × 90 mm, well off the origin."""
     foot = trimesh.creation.box((60.0, 40.0, 20.0), trimesh.transformations.translation_matrix((230.0, 50.0, 10.0)))
     post = trimesh.creation.box((20.0, 40.0, 70.0), trimesh.transformations.translation_matrix((210.0, 50.0, 55.0)))
     return trimesh.util.concatenate([foot, post])
@@ -46,7 +46,7 @@ def _is_inside(corners: np.ndarray, point: np.ndarray) -> bool:
     return bool((equations[:, :3] @ point + equations[:, 3] < 0).all())
 
 
-def test_it_stands_in_the_scene_on_its_lowest_point_and_stays(tmp_path):
+def test_it_rests_in_the_scene_on_its_lowest_point(tmp_path):
     name, grasp_object = load_mesh_object(write(tmp_path / "bracket.stl", bracket()), 1e-3, 0.15)
     for pitch_deg in (0.0, 45.0):
         scene = SceneConfig(object=name, shape=grasp_object, pitch_deg=pitch_deg)

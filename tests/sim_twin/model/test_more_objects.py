@@ -17,7 +17,7 @@ def world(request: pytest.FixtureRequest) -> World:
     return World(SceneConfig(object=request.param))
 
 
-def test_it_stands_upright_by_itself(world: World) -> None:
+def test_it_stays_upright(world: World) -> None:
     start = world.config.T_base_object()
     world.advance_to(1.0)
     pose = world.T_base_object()
@@ -26,7 +26,7 @@ def test_it_stands_upright_by_itself(world: World) -> None:
     assert np.abs(world.data.qvel[-6:]).max() < 1e-2
 
 
-def test_it_is_drawn_where_it_stands(world: World) -> None:
+def test_it_is_drawn_at_its_pose(world: World) -> None:
     renderer = make_renderer(world.model, INTRINSICS, "rays")
     data = world.snapshot()
     view = renderer.render(data)

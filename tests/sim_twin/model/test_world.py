@@ -72,7 +72,7 @@ def test_no_motor_gives_more_than_its_limit() -> None:
 
 
 def _put_between_the_jaws(world: World, along_m: float) -> np.ndarray:
-    """Level the gripper, set the object upright beside the stator's pad, close to 3 Nm; return the command (7,)."""
+    """Level the gripper, set the object upright next to the stationary jaw's pad, close to 3 Nm; return the command (7,)."""
     q = _LOW.copy()
     data, model = world.data, world.model
     data.qpos[: z1.N_JOINTS], data.qvel[:] = q, 0.0
@@ -121,7 +121,7 @@ def test_a_held_object_is_lifted_and_neither_slips_nor_sinks_in(name: str) -> No
 
 
 @pytest.mark.parametrize("pitch_deg", [-45.0, 45.0])
-def test_a_leaning_object_stays_put_while_nobody_touches_it(pitch_deg: float) -> None:
+def test_a_leaning_object_stays_put_until_touched(pitch_deg: float) -> None:
     world = World(SceneConfig(object="bottle", pitch_deg=pitch_deg))
     world.advance_to(1.0)
     assert world.fixture_holds
@@ -129,7 +129,7 @@ def test_a_leaning_object_stays_put_while_nobody_touches_it(pitch_deg: float) ->
 
 
 def _run_into_the_object(world: World) -> None:
-    """Turn joint 1 with the gripper low, so that it sweeps through where the object stands."""
+    """Turn joint 1 with the gripper low, so that it sweeps through the object's place."""
     start = np.array([-0.6, 2.0, -0.5, -1.1, 0.0, 1.57, -0.2])
     world.data.qpos[: z1.N_JOINTS] = start
     world.set_command(start, np.zeros(z1.N_JOINTS))

@@ -46,7 +46,7 @@ def test_the_gripper_s_points_cover_its_meshes_without_gaps():
     assert 1500 < len(shape) < 3000
     mesh = trimesh.load_mesh(z1.mesh_dir() / "collision" / "z1_GripperMover.STL")
     dense = trimesh.sample.sample_surface(mesh, 20_000, seed=3)[0]
-    assert cKDTree(shape.mover).query(dense)[0].max() < 0.008
+    assert cKDTree(shape.moving_jaw).query(dense)[0].max() < 0.008
 
 
 @pytest.mark.parametrize(

@@ -56,13 +56,13 @@ def test_the_flange_is_where_the_urdf_lengths_put_it_by_hand() -> None:
         np.testing.assert_allclose(KINEMATICS.flange(q), T, atol=1e-9)
 
 
-def test_the_pivot_lies_100_mm_along_the_flange_x_axis() -> None:
+def test_the_pivot_is_100_mm_along_the_flange_x_axis() -> None:
     T_base_flange, T_base_pivot = KINEMATICS.flange(z1.Q_HOME), KINEMATICS.pivot(z1.Q_HOME)
     np.testing.assert_allclose(T_base_pivot[:3, 3] - T_base_flange[:3, 3], 0.1 * T_base_flange[:3, 0], atol=1e-12)
     np.testing.assert_allclose(T_base_pivot[:3, :3], T_base_flange[:3, :3], atol=1e-12)
 
 
-def test_link_poses_start_at_the_base_and_turn_the_mover_about_the_pivot() -> None:
+def test_link_poses_start_at_the_base_and_turn_the_moving_jaw_about_the_pivot() -> None:
     closed = KINEMATICS.link_poses(np.append(z1.Q_HOME, 0.0))
     opened = KINEMATICS.link_poses(np.append(z1.Q_HOME, -1.0))
     np.testing.assert_array_equal(closed["link00"], np.eye(4))
@@ -198,14 +198,14 @@ def test_follow_names_the_first_waypoint_out_of_reach() -> None:
     assert len(KINEMATICS.follow(Ts[:waypoint], z1.Q_HOME)) == waypoint
 
 
-@pytest.mark.parametrize("spoil", ["nan", "shape", "mirror", "scale"])
-def test_what_is_not_a_pose_is_refused(spoil: str) -> None:
+@pytest.mark.parametrize("fault", ["nan", "shape", "mirror", "scale"])
+def test_an_invalid_pose_is_rejected(fault: str) -> None:
     T = np.eye(4)
-    if spoil == "nan":
+    if fault == "nan":
         T[0, 3] = np.nan
-    elif spoil == "shape":
+    elif fault == "shape":
         T = T[:3]
-    elif spoil == "mirror":
+    elif fault == "mirror":
         T[0, 0] = -1.0
     else:
         T[:3, :3] *= 2.0

@@ -12,10 +12,10 @@ from hal.base import z1
 from hal.base.transforms import inverse
 from hal.base.z1_gripper import JAW_REACH_M, KNEE_RADIUS_M, MOVING_FACE, STATIONARY_FACE, moving_jaw_pose
 from tests.support.errors import raises
-from z1_runtime.geometry.gripper_geometry import BeakConfig
+from z1_runtime.geometry.gripper_geometry import GripperPlacementConfig
 from z1_runtime.grasping.beak_gripper import BeakGripper, WidthError
 
-TIGHT = BeakConfig(clearance_m=0.0)
+TIGHT = GripperPlacementConfig(clearance_m=0.0)
 
 
 def surface(name: str, offset_x: float) -> np.ndarray:
@@ -31,14 +31,16 @@ def stator() -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def mover() -> np.ndarray:
+def moving_jaw() -> np.ndarray:
     return surface("z1_GripperMover", 0.0)
 
 
-def lateral_gaps(T_base_pivot: np.ndarray, jaw: float, stator: np.ndarray, mover: np.ndarray, r: float) -> list[float]:
+def lateral_gaps(
+    T_base_pivot: np.ndarray, jaw: float, stator: np.ndarray, moving_jaw: np.ndarray, r: float
+) -> list[float]:
     """Return each jaw's distance from a disc-shaped pillar of radius `r` along grasp x at the grasp frame's origin."""
     gaps = []
-    for T, points in ((T_base_pivot, stator), (T_base_pivot @ moving_jaw_pose(jaw), mover)):
+    for T, points in ((T_base_pivot, stator), (T_base_pivot @ moving_jaw_pose(jaw), moving_jaw)):
         in_grasp = points @ T[:3, :3].T + T[:3, 3]
         gaps.append(float(np.hypot(in_grasp[:, 1], in_grasp[:, 2]).min() - r))
     return gaps
@@ -49,14 +51,16 @@ def without_palm(stator: np.ndarray) -> np.ndarray:
     return stator[stator[:, 0] > 0.045]
 
 
-def contact_frame(config: BeakConfig) -> np.ndarray:
+def contact_frame(config: GripperPlacementConfig) -> np.ndarray:
     """Return a grasp whose contact axis is the base frame's y axis."""
     T = np.eye(4)
     T[2, 3] = config.contact_depth_m
     return T
 
 
-@pytest.mark.parametrize(("face", "name", "offset"), [(STATIONARY_FACE, "stator", 0.0), (MOVING_FACE, "mover", 0.0)])
+@pytest.mark.parametrize(
+    ("face", "name", "offset"), [(STATIONARY_FACE, "stator", 0.0), (MOVING_FACE, "moving_jaw", 0.0)]
+)
 def test_the_measured_faces_are_on_the_meshes(face, name, offset, request):
     points = request.getfixturevalue(name)
     middle = points[np.abs(points[:, 1]) < 0.02][:, [0, 2]]
@@ -71,27 +75,27 @@ def test_knees_and_tips_agree_with_the_faces():
 
 
 @pytest.mark.parametrize("width", [0.01, 0.02, 0.03, 0.04, 0.05, 0.06, 0.07, 0.08])
-def test_both_jaws_touch_a_round_object_of_that_width(width, stator, mover):
+def test_both_jaws_touch_a_round_object_of_that_width(width, stator, moving_jaw):
     for grasp in BeakGripper(TIGHT).fit(contact_frame(TIGHT), width):
-        gaps = lateral_gaps(grasp.T_base_pivot, grasp.jaw_contact, stator, mover, 0.5 * width)
+        gaps = lateral_gaps(grasp.T_base_pivot, grasp.jaw_contact, stator, moving_jaw, 0.5 * width)
         assert np.abs(gaps).max() < 0.0015, gaps
 
 
 @pytest.mark.parametrize("width", [0.02, 0.04, 0.06, 0.08])
-def test_while_approaching_both_jaws_keep_their_clearance(width, stator, mover):
-    config = BeakConfig()
+def test_while_approaching_both_jaws_keep_their_clearance(width, stator, moving_jaw):
+    config = GripperPlacementConfig()
     for grasp in BeakGripper(config).fit(contact_frame(config), width):
-        gaps = lateral_gaps(grasp.T_base_pivot, grasp.jaw_open, without_palm(stator), mover, 0.5 * width)
+        gaps = lateral_gaps(grasp.T_base_pivot, grasp.jaw_open, without_palm(stator), moving_jaw, 0.5 * width)
         assert gaps == pytest.approx([config.clearance_m] * 2, abs=0.0015)
 
 
 @pytest.mark.parametrize("width", [0.02, 0.04, 0.06, 0.08])
-def test_while_closing_the_gripper_turns_so_that_both_jaws_arrive_together(width, stator, mover):
-    config = BeakConfig()
+def test_while_closing_the_gripper_turns_so_that_both_jaws_arrive_together(width, stator, moving_jaw):
+    config = GripperPlacementConfig()
     for grasp in BeakGripper(config).fit(contact_frame(config), width):
         assert grasp.T_base_touch[:3, 3] == pytest.approx(grasp.T_base_pivot[:3, 3], abs=1e-12)
         assert grasp.T_base_touch[:3, 1] == pytest.approx(grasp.T_base_pivot[:3, 1], abs=1e-12)
-        gaps = lateral_gaps(grasp.T_base_touch, grasp.jaw_touch, stator, mover, 0.5 * width)
+        gaps = lateral_gaps(grasp.T_base_touch, grasp.jaw_touch, stator, moving_jaw, 0.5 * width)
         assert gaps == pytest.approx([-0.5 * config.squeeze_m] * 2, abs=0.0015)
         assert grasp.jaw_open < grasp.jaw_contact < grasp.jaw_touch < 0.0
 
@@ -106,7 +110,7 @@ def test_the_flips_put_the_stationary_jaw_on_opposite_sides():
 
 @pytest.mark.parametrize("width", [0.02, 0.045, 0.065])
 def test_the_fingertips_pass_the_contacts_and_the_squeeze_is_level(width):
-    config = BeakConfig()
+    config = GripperPlacementConfig()
     gripper = BeakGripper(config)
     grasp, _ = gripper.fit(contact_frame(config), width)
     tip = grasp.T_base_touch @ np.array([*STATIONARY_FACE[0, :1], 0.0, STATIONARY_FACE[0, 1], 1.0])
@@ -122,7 +126,7 @@ def test_a_width_beyond_the_friction_cone_is_rejected_with_figures():
         gripper.fit(np.eye(4), 0.100)
     assert "100 mm wide" in str(caught.value)
     assert "up to 84 mm" in str(caught.value)
-    assert BeakGripper(BeakConfig(friction=0.2)).max_width_m < gripper.max_width_m - 0.005
+    assert BeakGripper(GripperPlacementConfig(friction=0.2)).max_width_m < gripper.max_width_m - 0.005
 
 
 @pytest.mark.parametrize("width", [0.0, -0.01, float("nan")])
@@ -132,7 +136,7 @@ def test_a_width_that_is_not_positive_is_rejected(width):
 
 
 def test_a_deep_object_is_held_nearer_its_front_and_a_deeper_one_rejected(stator):
-    config = BeakConfig()
+    config = GripperPlacementConfig()
     gripper = BeakGripper(config)
     shallow, _ = gripper.fit(contact_frame(config), 0.04, 0.02)
     deep, _ = gripper.fit(contact_frame(config), 0.04, 0.055)

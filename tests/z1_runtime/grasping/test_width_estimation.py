@@ -70,7 +70,7 @@ def test_a_grasp_off_the_centre_gets_its_offset(offset_m):
 @pytest.mark.parametrize("side", [-1.0, 1.0])
 def test_an_unobserved_contact_is_assumed_farther_out(side):
     observed = pillar()[pillar()[:, 1] * side < 0.2 * RADIUS_M]
-    estimate = estimate_widths(frontal(), np.array([2 * RADIUS_M]), observed, DEPTH_M, occlusion_margin_m=0.004)
+    estimate = estimate_widths(frontal(), np.array([2 * RADIUS_M]), observed, DEPTH_M, occluded_margin_m=0.004)
     assert estimate.widths_m == pytest.approx([2 * RADIUS_M + 0.004], abs=1e-3)
     assert estimate.shifts_m == pytest.approx([side * 0.002], abs=1e-3)
 

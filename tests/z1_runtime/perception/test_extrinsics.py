@@ -20,7 +20,7 @@ ERRORS = dict.fromkeys(("rms_mm", "rms_deg", "holdout_mm", "holdout_deg", "diver
 
 
 def keep(folder: Path, serial: str, shift_m: float, *, uncertainty_mm: float = 0.1, **changes) -> Path:
-    """Save a hand-eye result `shift_m` beside the drawing's mount."""
+    """Save a hand-eye result `shift_m` off the drawing's extrinsics."""
     T_flange_camera = z1.T_FLANGE_CAMERA.copy()
     T_flange_camera[0, 3] += shift_m
     fields = {
@@ -52,7 +52,7 @@ def test_the_newest_of_this_camera_is_used_with_a_message(tmp_path: Path):
     assert str(newest) in mount.origin and "camera A" in mount.origin and "±0.10 mm" in mount.origin
 
 
-def test_a_damaged_newest_result_gives_way_to_the_one_before(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+def test_a_damaged_newest_result_is_skipped(tmp_path: Path, caplog: pytest.LogCaptureFixture):
     keep(tmp_path, "A", 0.001)
     newest = keep(tmp_path, "A", 0.002)
     newest.write_text(newest.read_text()[:100])

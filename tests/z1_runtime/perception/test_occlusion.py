@@ -44,6 +44,6 @@ def test_a_gap_that_the_table_separates_from_the_object_hides_nothing_of_it():
     assert occluded_points(depth, INTRINSICS, solid).shape == (0, 3)
 
 
-def test_the_thin_shadow_that_stereo_leaves_beside_an_edge_is_no_hiding_place():
+def test_the_thin_stereo_shadow_at_an_edge_occludes_nothing():
     depth, solid = picture((ROWS, slice(180, 190)))
     assert occluded_points(depth, INTRINSICS, solid).shape == (0, 3)

@@ -58,7 +58,7 @@ def test_a_lone_depth_between_two_surfaces_is_not_continuous():
     assert continuous.sum() == depth.size - 1
 
 
-def test_a_hole_continues_nobody_and_its_rim_stays():
+def test_a_hole_is_continuous_with_no_neighbour_and_its_rim_stays():
     depth = np.full((9, 9), 0.3)
     depth[3:6, 3:6] = 0.0
     assert (point_cloud.continuous_pixels(depth) == (depth > 0)).all()
@@ -71,7 +71,7 @@ def test_transform_applies_the_pose_and_its_inverse_undoes_it():
     np.testing.assert_allclose(transform_points(np.linalg.inv(T), transform_points(T, points)), points, atol=1e-12)
 
 
-def test_the_depth_clip_keeps_what_lies_between_the_percentiles():
+def test_the_depth_clip_keeps_points_between_the_percentiles():
     points = np.zeros((101, 3))
     points[:, 2] = np.random.default_rng(0).permutation(101)  # percentile p of 0…100 is p
     assert sorted(points[point_cloud.depth_clip(points), 2]) == list(range(1, 100))

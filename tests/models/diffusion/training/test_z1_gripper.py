@@ -10,7 +10,7 @@ from models.diffusion.training.labels import check_grasps, find_grasps
 from models.diffusion.training.shapes import make_shape
 from models.diffusion.training.solids import BOX, make_part, make_solid
 from tests.support.errors import raises
-from z1_runtime.geometry.gripper_geometry import BeakConfig
+from z1_runtime.geometry.gripper_geometry import GripperPlacementConfig
 from z1_runtime.geometry.gripper_mesh import gripper_shape
 from z1_runtime.grasping.beak_gripper import BeakGripper
 
@@ -31,7 +31,7 @@ def around_the_bar(at_y: float = 0.0, turned: float = 0.0) -> np.ndarray:
 
 def test_the_fit_around_a_width_is_the_runtimes():
     runtime = BeakGripper()
-    assert BeakConfig().contact_depth_m == z1_gripper.CONTACT_DEPTH_M
+    assert GripperPlacementConfig().contact_depth_m == z1_gripper.CONTACT_DEPTH_M
     for width in np.arange(0.004, 0.084, 0.004):
         expected, _ = runtime.fit(np.eye(4), float(width))
         T_pivot, opening = z1_gripper._place(np.eye(4), np.array(z1_gripper.GRIPPER_FIT), width)
@@ -45,7 +45,7 @@ def test_the_outer_sides_are_those_of_the_meshes():
     shape = gripper_shape()
     for points, outline, lowest in (
         (shape.fixed, z1_gripper.STATIONARY_BACK, True),
-        (shape.mover, z1_gripper.MOVING_BACK, False),
+        (shape.moving_jaw, z1_gripper.MOVING_BACK, False),
     ):
         for x, z in outline[:-1]:
             near = points[(np.abs(points[:, 0] - x) < 0.006) & (np.abs(points[:, 1]) < 0.042)]

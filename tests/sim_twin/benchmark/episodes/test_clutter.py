@@ -22,7 +22,7 @@ CLUTTERED = Scenario(object="cylinder", distance="mid", lateral="left", pitch_de
 
 
 def footprint(scene):
-    """Return where (2,) each thing stands and how far it reaches from there [m], the object first."""
+    """Return the position (2,) and the reach of each thing on the table [m], the object first."""
     pose = scene.T_base_object()
     things = [(pose, scene.grasp_object)]
     things += [(neighbour.T_base_object(), OBJECTS[neighbour.object]) for neighbour in scene.neighbours]

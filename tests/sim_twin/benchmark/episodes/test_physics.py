@@ -50,16 +50,16 @@ def test_without_noise_nothing_is_off():
     np.testing.assert_array_equal(plain.scene().T_flange_camera(), z1.T_FLANGE_CAMERA)
 
 
-def test_a_late_arm_does_what_it_is_told_later_and_stops_at_once():
+def test_actuation_latency_delays_setpoints_but_not_the_stop():
     world = World(SceneConfig(arm_latency_s=0.01))
     arm = TwinArm(world)
     arm.connect()
     q, before = world.read_arm()[0], world.data.ctrl.copy()
-    told = [ArmSetpoint(q=q + 0.001 * n * np.eye(7)[0], dq=np.zeros(7)) for n in range(1, 8)]
-    for setpoint in told[:5]:
+    sent = [ArmSetpoint(q=q + 0.001 * n * np.eye(7)[0], dq=np.zeros(7)) for n in range(1, 8)]
+    for setpoint in sent[:5]:
         arm.send(setpoint)
         np.testing.assert_array_equal(world.data.ctrl, before)
-    for setpoint, due in zip(told[5:], told, strict=False):
+    for setpoint, due in zip(sent[5:], sent, strict=False):
         arm.send(setpoint)
         np.testing.assert_allclose(world.data.ctrl, z1.KP * due.q)
     arm.stop()

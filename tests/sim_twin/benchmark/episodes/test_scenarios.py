@@ -19,7 +19,7 @@ def test_every_scenario_is_one_that_the_twin_can_build():
         assert scene.T_base_object()[0, 3] == pytest.approx({"near": 0.40, "mid": 0.48, "far": 0.56}[scenario.distance])
 
 
-def test_the_extended_set_stands_upright_in_nine_poses_an_object():
+def test_the_extended_set_has_nine_upright_poses_per_object():
     scenarios = grid(objects=OBJECT_SETS["extended"])
     assert len(scenarios) == 9 * len(EXTENDED_OBJECTS)
     assert {s.pitch_deg for s in scenarios} == {0.0}

@@ -50,7 +50,7 @@ def test_every_plot_is_well_formed(page):
         ElementTree.fromstring(plot)
 
 
-def test_the_headline_says_both_readings_beside_the_papers(tmp_path):
+def test_the_headline_has_both_readings_and_the_papers(tmp_path):
     rows = make_rows(("vanilla", "mvb", "full"))
     page = write(tmp_path / "report.html", rows)
     for method, paper in (("vanilla", "24.7% of 81"), ("mvb", "59.3% of 81"), ("full", "–")):
@@ -139,7 +139,7 @@ def test_the_same_figures_give_the_same_bytes():
     assert first == second
 
 
-def test_the_papers_known_figures_stand_beside_ours_and_no_others(page):
+def test_the_papers_known_figures_are_next_to_ours(page):
     start = page.index("<h2>The paper's tables, and ours</h2>")
     tables = page[start : page.index("<h2>Methods against each other")]
     assert re.findall(r"<h3>(\d)", tables) == ["1", "2", "3", "4", "5"]

@@ -65,7 +65,7 @@ def pairs(both: int, only_first: int, only_second: int, neither: int) -> tuple[n
     return first.astype(bool), second.astype(bool)
 
 
-def test_the_difference_of_two_methods_lies_in_its_interval_and_turns_round_with_them():
+def test_the_difference_of_two_methods_is_in_its_interval_and_antisymmetric():
     first, second = pairs(40, 20, 6, 15)
     low, high = paired_difference(first, second)
     assert low < 14 / 81 < high

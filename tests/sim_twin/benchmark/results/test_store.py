@@ -21,7 +21,7 @@ def test_rows_come_back_sorted_whatever_their_columns(tmp_path):
     assert found[2]["slip_m"] == 0.01
 
 
-def test_a_second_run_does_not_mix_with_the_first_unless_told(tmp_path):
+def test_a_second_run_does_not_mix_with_the_first_by_default(tmp_path):
     Store(tmp_path, resume=False).add(rows("a"))
     with raises(OutputExistsError, "output_exists"):
         Store(tmp_path, resume=False)
@@ -36,7 +36,7 @@ def test_what_a_killed_run_left_half_written_is_not_a_row(tmp_path):
     assert not list((tmp_path / "episodes").glob("*.partial"))
 
 
-def test_methods_added_later_stand_beside_the_earlier_ones(tmp_path):
+def test_methods_added_later_join_the_earlier_ones(tmp_path):
     store = Store(tmp_path, resume=False)
     store.add(rows("a"))
     store.add([{"scenario": "a", "method": "mvb:k=3", "success": True}])

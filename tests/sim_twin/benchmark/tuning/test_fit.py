@@ -1,4 +1,4 @@
-"""What is planted in made-up rows is found, and noise is not believed."""
+"""Fits find a planted effect in synthetic rows, and reject noise."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ pytest.importorskip("sklearn", reason="uv sync --inexact --extra tune")
 POSES = np.array([f"pose{n // 2}" for n in range(120)])
 
 
-def test_no_pose_stands_on_both_sides_of_a_fold_and_each_is_judged_once():
+def test_no_pose_is_on_both_sides_of_a_fold_and_each_is_evaluated_once():
     folds = list(make_folds(POSES))
     assert len(folds) == 5
     assert sorted(np.concatenate([test for _, test in folds])) == list(range(len(POSES)))
@@ -70,11 +70,11 @@ def test_a_planted_threshold_is_found_and_holds():
 
 def test_a_threshold_in_noise_does_not_hold():
     rng = np.random.default_rng(2)
-    believed = 0
+    accepted = 0
     for _ in range(40):
         found = fit_threshold(rng.uniform(size=len(POSES)), rng.uniform(size=len(POSES)) < 0.6, POSES)
-        believed += found is not None and found.is_significant
-    assert believed <= 6  # 2 of 40 at 0.05
+        accepted += found is not None and found.is_significant
+    assert accepted <= 6  # 2 of 40 at 0.05
 
 
 def test_where_more_is_worse_or_all_ended_alike_there_is_no_threshold():
@@ -89,7 +89,7 @@ def planted() -> Samples:
     return extract_samples([episode(s, "mvb", n % 3 != 0, candidate=n) for n, s in enumerate(scenarios(1, 2))], "top1")
 
 
-def test_a_head_finds_the_feature_that_tells(planted):
+def test_a_head_finds_the_informative_feature(planted):
     report = fit_head(planted)
     assert report is not None
     assert report.beats_base_rate

@@ -35,7 +35,7 @@ def test_methods_that_chose_the_same_grasp_tell_of_it_once():
     assert len(predictions([*same, episode(THERE, "full", True, candidate=7)], "top1")) == 2
 
 
-def test_an_episode_without_a_plan_tells_of_its_first_grasp_alone():
+def test_an_episode_without_a_plan_yields_its_first_grasp_alone():
     row = episode(HERE, "mvb", False, rank=3) | {"rank": None, "candidate": None}
     assert predictions([row], "top1") == [("mvb", "first", False)]
     assert predictions([row], "fallthrough") == []

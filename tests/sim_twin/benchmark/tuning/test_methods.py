@@ -1,4 +1,4 @@
-"""A method of the benchmark takes its numbers from a scoring file; and `full` heeds the settings it is given."""
+"""A method of the benchmark takes its numbers from a scoring file; and `full` applies the settings it is given."""
 
 from dataclasses import replace
 
@@ -74,7 +74,7 @@ def test_full_uses_its_settings_and_else_the_configurations(seen, decider):
     assert order("full:k=2", seen, decider)[1] == order("full", seen, decider)[1]
 
 
-def test_a_head_orders_the_grasps_of_mvb_by_what_it_was_told_to_like(seen, decider, file):
+def test_a_head_orders_the_grasps_of_mvb_by_its_features(seen, decider, file):
     best_first, _ = parse_method(f"mvb:scoring={file},k=2,hard_filter=yes").order(seen, decider, StageTimes())
     heights = measure_features(best_first.candidates)[:, 3]
     assert (np.diff(heights) <= 1e-9).all()

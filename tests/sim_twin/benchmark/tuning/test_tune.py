@@ -29,7 +29,7 @@ def half(n):
 
 
 class Runs:
-    """Stands for the twin: what it is asked for ends as `works` says of the method."""
+    """Fake twin: an episode succeeds as `works` says of the method."""
 
     def __init__(self, works):
         self.works, self.asked = works, []
