@@ -30,7 +30,7 @@ class RuntimeConfig:
     detector_weights: str = ""
     """Weights of `yolo`: .npz of ours, .pt of ultralytics, .onnx, OpenVINO's .xml or its folder; empty = ours."""
     detector_runtime: str = "auto"
-    """Inference runtime of `yolo`: `openvino`, `onnxruntime`, `torch`, or `auto`, the first of these that is installed."""
+    """Inference runtime of `yolo`: `openvino`, `onnxruntime`, `torch`, or `auto`, the first installed one of these."""
     detector_confidence: float = 0.5
     """Minimum detection confidence of `yolo`, in [0, 1)."""
     detector_mirrored: bool = True

@@ -53,7 +53,7 @@ class CalibrationRobot:
     camera: Camera
     clock: Clock
     ground_truth: Callable[[], GroundTruth] | None
-    """Ground ground_truth of the scene; None for a real robot."""
+    """Ground truth of the scene; None for a real robot."""
 
 
 @contextmanager

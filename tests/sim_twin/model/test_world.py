@@ -72,7 +72,7 @@ def test_no_motor_gives_more_than_its_limit() -> None:
 
 
 def _put_between_the_jaws(world: World, along_m: float) -> np.ndarray:
-    """Level the gripper, set the object upright next to the stationary jaw's pad, close to 3 Nm; return the command (7,)."""
+    """Level the gripper, put the object upright at the stationary jaw's pad, close to 3 Nm; return the joints (7,)."""
     q = _LOW.copy()
     data, model = world.data, world.model
     data.qpos[: z1.N_JOINTS], data.qvel[:] = q, 0.0
