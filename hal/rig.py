@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from hal.base.arm import Arm
 from hal.base.camera import Camera
 from hal.base.clock import Clock
-from hal.parking import Parking
 from hal.registry import Registry
+
+if TYPE_CHECKING:  # only a real arm is parked
+    from hal.parking import Parking
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

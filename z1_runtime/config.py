@@ -10,7 +10,6 @@ from typing import Any, Literal, get_args
 import yaml
 
 from hal.base.errors import InvalidValueError
-from hal.base.structure import read_yaml, structure
 from models.detector.runtimes import RUNTIMES
 from models.factory import Process, generator_for, split_generator_name
 from z1_runtime.grasping.ranking import Ranking, load_scoring
@@ -115,6 +114,8 @@ def load_config(path: Path | None = None) -> RuntimeConfig:
     """
     if path is None:
         return RuntimeConfig()
+    from hal.base.structure import read_yaml
+
     return config_from(read_yaml(path, "the configuration") or {}, str(path))
 
 
@@ -124,6 +125,8 @@ def config_from(data: Mapping[str, Any], where: str) -> RuntimeConfig:
     Raises:
         ConfigError: an unknown key or an invalid value; the message begins with `where`.
     """
+    from hal.base.structure import structure
+
     return structure(RuntimeConfig, data, where)
 
 

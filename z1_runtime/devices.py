@@ -41,7 +41,6 @@ def connect_rig(rig: Rig, *, camera: bool = True) -> Iterator[Devices]:
     """
     from hal.servo.guard import Guard
     from hal.servo.servo import Servo
-    from hal.servo.servo_thread import ServoThread
 
     servo = Servo(rig.arm, rig.clock, guard=Guard())
     with ExitStack() as stack:
@@ -53,6 +52,8 @@ def connect_rig(rig: Rig, *, camera: bool = True) -> Iterator[Devices]:
         if rig.call_every_tick is not None:
             rig.call_every_tick(servo.tick)
         else:
+            from hal.servo.servo_thread import ServoThread
+
             stack.enter_context(ServoThread(servo, rig.clock))
         yield Devices(
             arm=servo,

@@ -31,7 +31,7 @@ if TYPE_CHECKING:  # detector, generator and planner take seconds to load, and o
     from hal.servo.guard import Guard
     from models.types import GraspGenerator
     from z1_runtime.geometry.kinematics import Kinematics
-    from z1_runtime.perception.detectors import Detector
+    from z1_runtime.perception.detector import Detector
     from z1_runtime.tasks.grasp_selection import GraspSelector
     from z1_runtime.tasks.pick import Phase, PickResult
 

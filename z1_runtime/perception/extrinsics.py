@@ -5,13 +5,15 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from calibration.errors import CalibrationError
-from calibration.results import CalibrationResult, load_newest, load_result
 from hal.base import z1
 from hal.base.errors import ConfigError
+
+if TYPE_CHECKING:
+    from calibration.results import CalibrationResult
 
 FOLDER_VARIABLE = "Z1_CALIBRATIONS"
 """Environment variable with the folder of the results."""
@@ -49,6 +51,11 @@ def find_extrinsics(serial: str, file: Path | None = None, folder: Path | None =
         ConfigError: `file` is missing or damaged, of another camera, or no hand-eye result of a wrist camera.
     """
     folder = results_folder(folder)
+    if file is None and not (folder.is_dir() and any(folder.iterdir())):
+        return _nominal(serial, folder)
+    from calibration.errors import CalibrationError  # OpenCV's calibration is needed only where there is a result
+    from calibration.results import load_newest, load_result
+
     try:
         found = load_result(file, serial=serial) if file is not None else load_newest(folder, "hand_eye", serial)
         T_flange_camera = found.T_flange_camera

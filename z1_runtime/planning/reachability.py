@@ -39,6 +39,8 @@ class RankedCandidates:
 
     ranked: RankedGrasps
     candidates: GraspCandidates
+    success_probability: np.ndarray | None = None
+    """(N,) of each, by the fitted head of the ranking; None without one."""
 
 
 class ReachabilityRanker:
@@ -65,9 +67,16 @@ class ReachabilityRanker:
         """
         if ranked.box is None:
             raise InvalidValueError("ReachabilityRanker: the grasps were ranked without a box.", code="no_box")
-        scores = self.scores(candidates, ranked.box, ranked.alignments, ranking)
+        probability = None
+        if ranking is not None and ranking.head is not None:
+            probability = ranking.head.probability(measure_features(candidates))
+        scores = self.scores(candidates, ranked.box, ranked.alignments, ranking, probability)
         order = np.argsort(-scores, kind="stable")  # as `RankedGrasps.reordered` sorts
-        return RankedCandidates(ranked=ranked.reordered(scores), candidates=candidates.reordered(order))
+        return RankedCandidates(
+            ranked=ranked.reordered(scores),
+            candidates=candidates.reordered(order),
+            success_probability=None if probability is None else probability[order],
+        )
 
     def scores(
         self,
@@ -75,6 +84,7 @@ class ReachabilityRanker:
         box: OrientedBox,
         alignments: np.ndarray,
         ranking: Ranking | None = None,
+        success_probability: np.ndarray | None = None,
     ) -> np.ndarray:
         """Return the score of each candidate, (N,).
 
@@ -85,11 +95,12 @@ class ReachabilityRanker:
             candidates: fitted here, as far as they are not yet.
             box: of the object, in the camera frame.
             alignments: (N,) with the box, in [0, 1].
-            ranking: whose head and thresholds count; None has neither.
+            ranking: whose thresholds count; None has none.
+            success_probability: (N,) by a fitted head, in place of the configured weights.
         """
         placements = [candidates.placements(rank) for rank in range(len(candidates))]
         free = np.array([each.rejection is None for each in placements], dtype=bool)
-        quality = self._expected_quality(candidates, box, alignments, ranking)
+        quality = self._expected_quality(candidates, box, alignments, success_probability)
         if ranking is not None:
             passes = ranking.passes_thresholds(alignments, candidates.grasps.scores)
             quality = np.where(passes, quality, _BELOW_THRESHOLD * quality)
@@ -107,11 +118,14 @@ class ReachabilityRanker:
         return scores
 
     def _expected_quality(
-        self, candidates: GraspCandidates, box: OrientedBox, alignments: np.ndarray, ranking: Ranking | None
+        self,
+        candidates: GraspCandidates,
+        box: OrientedBox,
+        alignments: np.ndarray,
+        success_probability: np.ndarray | None,
     ) -> np.ndarray:
         """Return the part of the scores that does not depend on the arm, (N,), in [0, 1)."""
-        if ranking is not None and ranking.head is not None:
-            success_probability = ranking.head.probability(measure_features(candidates))
+        if success_probability is not None:
             return _BELOW_ONE * (1.0 - self._config.manipulability) * success_probability
         centre = object_centre_from_table(box, candidates.scene)
         return _BELOW_ONE * self.quality(candidates, centre, alignments)

@@ -66,6 +66,8 @@ class GraspSelection:
     scene: PlanningScene
     ranked: RankedGrasps
     plan: GraspPlan
+    success_probability: float | None
+    """Of the planned grasp, by the fitted head of the ranking (`scoring` in the configuration); None without one."""
     stage_ms: dict[str, float]
     """By stage: detect, cloud, generate, mvbb, collision, rank, ik, plan, and their total."""
 
@@ -137,20 +139,22 @@ class GraspSelector:
         with times.stage("rank"):
             best_first = self.rank(filtered, scene)
         plan = self.planner.plan(best_first.candidates, q, times.stage)
+        probability = best_first.success_probability
         return GraspSelection(
             observation=observation,
             grasps=grasps,
             scene=scene,
             ranked=best_first.ranked,
             plan=plan,
+            success_probability=None if probability is None else float(probability[plan.rank]),
             stage_ms=dict(times.ms),
         )
 
     def observe(self, frame: RgbdFrame, q: np.ndarray, times: StageTimes | None = None) -> Observation:
-        """Return what `frame`, taken at joint positions `q` (7,), shows; `times` gets the stages detect and cloud.
+        """Return the observation of `frame`, taken at joints `q` (7,); `times` gets the stages detect and cloud.
 
         Raises:
-            PerceptionError: nothing usable was seen.
+            PerceptionError: no usable object was observed.
         """
         times = times or StageTimes()
         with times.stage("detect"):

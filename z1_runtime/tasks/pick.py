@@ -53,6 +53,16 @@ class PickResult:
     """Gripper torque after the lift [Nm]."""
 
     @property
+    def grasp(self) -> GraspPlan:
+        """The executed grasp with its motion."""
+        return self.selection.plan
+
+    @property
+    def success_probability(self) -> float | None:
+        """Probability of success of that grasp before it was tried; None without a fitted ranking."""
+        return self.selection.success_probability
+
+    @property
     def rejections(self) -> dict[str, int]:
         """Number of candidates that were tried and not taken, by reason."""
         return dict(Counter(rejection.reason.value for rejection in self.selection.plan.rejections))

@@ -9,8 +9,9 @@ import numpy as np
 
 from hal.base import z1
 from hal.base.messages import Intrinsics, RgbdFrame
+from models.types import Detection
 from z1_runtime.perception import extrinsics_check
-from z1_runtime.perception.detectors.ground_truth import GroundTruthDetector
+from z1_runtime.perception.detector import mask_box
 from z1_runtime.perception.errors import PerceptionError
 from z1_runtime.planning.planner import NoPlanError
 from z1_runtime.tasks.grasp_selection import GraspSelector
@@ -30,7 +31,7 @@ def warm_up_selector(selector: GraspSelector) -> None:
     q = np.append(z1.Q_HOME, config.jaw_home)
     T_base_camera = selector.kinematics.flange(z1.Q_HOME) @ selector.T_flange_camera
     frame = draw_can(T_base_camera)
-    (can,) = GroundTruthDetector().detect(frame, T_base_camera)
+    can = _detect_can(frame)
     filtered = selector.perception.filter_self(frame, config.jaw_home)
     with suppress(PerceptionError):  # a detector of colours finds no can in a black picture, but is warm then
         selector.perception.detect(filtered, T_base_camera)
@@ -39,6 +40,12 @@ def warm_up_selector(selector: GraspSelector) -> None:
         selector.select_from(observation, q)
     except (PerceptionError, NoPlanError) as error:  # a real scene may be feasible where this one is not
         _LOG.info("the warm-up scene has no plan under this configuration: %s", error)
+
+
+def _detect_can(frame: RgbdFrame) -> Detection:
+    mask = frame.ground_truth_mask
+    assert mask is not None
+    return Detection(label="can", confidence=1.0, box_px=mask_box(mask), mask=mask)
 
 
 def draw_can(T_base_camera: np.ndarray, radius_m: float = 0.03, height_m: float = 0.15) -> RgbdFrame:

@@ -77,7 +77,9 @@ def score(kinematics, observation, ranking: Ranking | None, alignments=(1.0, 1.0
     grasps = in_camera(observation.T_base_camera, [LOW, HIGH])
     candidates = make_candidates(kinematics, grasps, observation, chunk=None)
     ranker = ReachabilityRanker(kinematics, make_checker(kinematics, observation), PlannerConfig())
-    return ranker.scores(candidates, fit_upright_box(observation), np.array(alignments), ranking)
+    head = ranking.head if ranking else None
+    probability = head.probability(measure_features(candidates)) if head else None
+    return ranker.scores(candidates, fit_upright_box(observation), np.array(alignments), ranking, probability)
 
 
 def test_a_head_replaces_the_weights_among_reachable_grasps(kinematics, observation):

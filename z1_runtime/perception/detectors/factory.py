@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from importlib import import_module
 
 from hal.base.errors import InvalidValueError
 from models.detector.detector import YoloConfig
 from models.weights_file import WeightsError
 from z1_runtime.perception.detector import Detector
-from z1_runtime.perception.detectors.ground_truth import GroundTruthDetector
-from z1_runtime.perception.detectors.tabletop import TabletopDetector
-from z1_runtime.perception.detectors.yolo import YoloDetector
 
-_DETECTORS: dict[str, Callable[[YoloConfig], Detector]] = {
-    "tabletop": lambda _: TabletopDetector(),
-    "ground_truth": lambda _: GroundTruthDetector(),
-    "yolo": YoloDetector,
+_MODULE = "z1_runtime.perception.detectors"
+_DETECTORS = {
+    "tabletop": f"{_MODULE}.tabletop:TabletopDetector",
+    "ground_truth": f"{_MODULE}.ground_truth:GroundTruthDetector",
+    "yolo": f"{_MODULE}.yolo:YoloDetector",
 }
 DETECTORS = tuple(_DETECTORS)
 """The detectors by name."""
@@ -31,7 +29,9 @@ def make_detector(name: str, yolo: YoloConfig | None = None) -> Detector:
     if name not in _DETECTORS:
         known = ", ".join(sorted(_DETECTORS))
         raise InvalidValueError(f"there is no detector {name!r}; known: {known}.", code="unknown_detector")
+    module, kind = _DETECTORS[name].split(":")
+    arguments = (yolo or YoloConfig(),) if name == "yolo" else ()
     try:
-        return _DETECTORS[name](yolo or YoloConfig())
+        return getattr(import_module(module), kind)(*arguments)
     except WeightsError as err:
         raise WeightsError(f"{err} Without weights: --detector tabletop.", code=err.code) from err
