@@ -34,7 +34,6 @@ if TYPE_CHECKING:  # planner and viewer take seconds to load, which the HAL's ow
     from z1_runtime.config import RuntimeConfig
     from z1_runtime.robot import Robot
     from z1_runtime.tasks.pick import PickResult
-    from z1_runtime.tasks.warm_up import warm_up_selector
 
 WIRED_LEAD_S = 0.5
 """Motion queued at the servo when the twin runs in its own processes [s]; they delay a chunk by up to 0.1 s on one
@@ -121,6 +120,7 @@ def _open_robot(config: Config, process: HalProcess | None, console: Console) ->
     from z1_runtime.factory import make_grasp_selector
     from z1_runtime.perception.extrinsics import find_extrinsics
     from z1_runtime.robot import Robot
+    from z1_runtime.tasks.warm_up import warm_up_selector
 
     runtime = _runtime_config(config)
     save_config(runtime, config.out / "config.yaml")

@@ -150,7 +150,7 @@ def _describe_origin(weights: Path | None) -> dict | None:
 def _count_simulated(folder: Path) -> dict[str, dict[str, int]]:
     """Return the numbers of simulated and of lost ground-truth labels, by family."""
     totals: dict[str, Counter[str]] = {"tried": Counter(), "lost": Counter()}
-    for path in folder.glob("*.shaken.json"):
+    for path in folder.glob("*.simulated.json"):
         outcome = json.loads(path.read_text())
         for key, total in totals.items():
             total.update(outcome[key])

@@ -156,7 +156,7 @@ def summarise(clouds: list[CloudMetrics]) -> dict:
         "simulated": {
             key: {"tried": len(held), "held": int(held.sum())}
             for key in ("valid", "invalid", "best")
-            if len(held := np.concatenate([getattr(c, f"shaken_{key}") for c in clouds]))
+            if len(held := np.concatenate([getattr(c, f"simulated_{key}") for c in clouds]))
         },
         "raw_by_family": _by_family(clouds, raw),
         "returned_by_family": _by_family(clouds, returned),
