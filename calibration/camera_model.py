@@ -32,6 +32,7 @@ class CameraModel:
                 raise CalibrationError(
                     f"camera {name}: the value is not a finite array of shape {shape}:\n{array}", code="bad_camera"
                 )
+            # A frozen dataclass does not keep an array's elements from being changed
             array.setflags(write=False)
             object.__setattr__(self, name, array)
         width, height = self.size

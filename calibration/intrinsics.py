@@ -69,6 +69,7 @@ def calibrate_intrinsics(
     while True:
         camera, sd, errors, rotations = _fit([views[i] for i in kept], board)
         median = float(np.median(errors))
+        # One view at a time: a bad one raises the errors of the others too
         worst = int(np.argmax(errors))
         if errors[worst] < max(_OUTLIER * median, _MIN_OUTLIER_PX):
             break
@@ -128,6 +129,7 @@ def _check_number(n: int) -> None:
 def _fit(views: Sequence[BoardView], board: Board) -> tuple[CameraModel, np.ndarray, np.ndarray, np.ndarray]:
     """Return the camera, its standard deviations (9,), the error of each view (V,) [px] and its rotation (V, 3, 3)."""
     size = views[0].image_size
+    # OpenCV calibrates from float32 points only
     points = [np.float32(board.corners_m[view.ids]).reshape(-1, 1, 3) for view in views]
     pixels = [np.float32(view.pixels_px).reshape(-1, 1, 2) for view in views]
     criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 100, _EPSILON)

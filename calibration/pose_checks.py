@@ -28,6 +28,7 @@ def check_poses(Ts: np.ndarray, name: str) -> np.ndarray:
     if Ts.ndim != 3 or Ts.shape[1:] != (4, 4):
         raise CalibrationError(f"{name}: shape is {Ts.shape}, allowed is (N, 4, 4).", code="bad_poses")
     R = Ts[:, :3, :3]
+    # Values that are not finite are rejected below, without NumPy's warnings
     with np.errstate(invalid="ignore"):
         deviations = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max(axis=(1, 2), initial=0.0)
         good = np.isfinite(Ts).all(axis=(1, 2)) & (deviations < _ORTHONORMAL_ATOL) & (np.linalg.det(R) > 0.0)
@@ -36,5 +37,6 @@ def check_poses(Ts: np.ndarray, name: str) -> np.ndarray:
         bad = int(np.flatnonzero(~good)[0])
         raise CalibrationError(f"{name}[{bad}]: the matrix is no rigid transform:\n{Ts[bad]}", code="bad_poses")
     if len(Ts):
+        # SciPy makes the matrices orthonormal: a file's rounded digits would accumulate in products
         Ts[:, :3, :3] = Rotation.from_matrix(R).as_matrix()
     return Ts

@@ -94,6 +94,7 @@ class TwinArm:
         """Hold the position measured now."""
         self._pending.clear()
         q, _, _ = self.world.read_arm()
+        # MuJoCo's joint limits yield a little under load: a measured position may be just beyond one
         self.world.set_command(np.clip(q, z1.Q_MIN, z1.Q_MAX), np.zeros(z1.N_JOINTS))
 
     def _catch_up(self) -> None:
@@ -126,6 +127,7 @@ class TwinCamera:
         self._kind = renderer
         self._thread: ThreadPoolExecutor | None = None
         self._renderer: WristRenderer | None = None
+        # Images are drawn from a copy of the state, so that the physics can go on meanwhile
         self._snapshot = mujoco.MjData(self.world.model)
         self._first_s = 0.0
         self._sequence = 0

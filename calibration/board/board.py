@@ -45,6 +45,7 @@ class Board:
         families = sorted(name for name in dir(cv2.aruco) if name.startswith("DICT_"))
         if self.dictionary not in families:
             raise _impossible(f"unknown dictionary ({self.dictionary!r}, known: {', '.join(families)})")
+        # With two columns or rows all inner corners are on one line, which determines no homography
         if self.columns < 3 or self.rows < 3:
             raise _impossible(f"too few squares ({self.columns} × {self.rows}, allowed from 3 × 3)")
         if not 0.002 <= self.square_m <= 0.5:
@@ -82,6 +83,7 @@ class Board:
             for column in range(self.columns)
             if (row + column) % 2 == int(self.legacy and self.rows % 2 == 0)
         ]
+        # OpenCV's markers have a black border of one module on each side (`borderBits`)
         board, modules = make_opencv_board(self), _dictionary(self.dictionary).markerSize + 2
         module_m = self.marker_m / modules
         for marker, outline in zip(np.ravel(board.getIds()), board.getObjPoints(), strict=True):

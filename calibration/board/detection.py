@@ -23,6 +23,7 @@ TOO_BLURRED = 0.18
 
 # rms distance between detected and projected corners in edges of a square; the corners of another board exceed it
 _MAX_LAYOUT_ERROR = 0.15
+# The largest dictionary of each size: OpenCV's smaller ones are the first entries of these
 _OTHER_FAMILIES = ("DICT_4X4_1000", "DICT_5X5_1000", "DICT_6X6_1000", "DICT_7X7_1000", "DICT_APRILTAG_36h11")
 
 
@@ -123,6 +124,7 @@ def _other_board(grey: np.ndarray, board: Board, n_corners: int, markers: np.nda
     if len(_find(grey, other)[0]) >= MIN_CORNERS:
         return f"its markers are on the other colour, set `legacy` to {other.legacy}"
     own = board.columns * board.rows // 2
+    # OpenCV numbers the markers of a board from 0 on
     if (markers >= own).any():
         return f"markers {markers[markers >= own].tolist()} were detected, the settings have 0 … {own - 1}"
     if len(markers) >= own / 2:
@@ -139,6 +141,7 @@ def _other_board(grey: np.ndarray, board: Board, n_corners: int, markers: np.nda
 def _check_layout(ids: np.ndarray, pixels: np.ndarray, board: Board) -> None:
     """Reject corners that do not fit a plane with this pattern: the print has other columns or rows than the board."""
     plane = board.corners_m[ids, :2].astype(np.float64)
+    # Method 0 is least squares over all corners: a robust one would drop those that contradict the layout
     homography, _ = cv2.findHomography(plane, pixels, 0)
     if homography is None:
         raise CalibrationError(
@@ -178,7 +181,9 @@ def _edge_gradient(grey: np.ndarray, ends: np.ndarray) -> float:
     length = np.linalg.norm(along, axis=1, keepdims=True)
     across = np.stack([-along[:, 1], along[:, 0]], axis=1) / length
     reach = np.clip(0.35 * np.median(length), 3.0, 12.0)
+    # Four samples a pixel, so that the difference over four of them below is one over a pixel
     offsets = np.linspace(-reach, reach, int(2 * reach) * 4 + 1)
+    # Only the middle of an edge: at both ends another edge crosses it
     middles = ends[:, 0, None] + along[:, None] * np.array([0.3, 0.4, 0.5, 0.6, 0.7])[:, None]  # (E, 5, 2)
     at = middles[:, :, None] + across[:, None, None] * offsets[:, None]  # (E, 5, K, 2)
     at = at.reshape(len(ends), -1, 2).astype(np.float32)

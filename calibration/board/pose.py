@@ -45,11 +45,13 @@ def estimate_board_pose(view: BoardView, board: Board, camera: CameraModel) -> B
         points, pixels, camera.matrix, camera.distortion, flags=cv2.SOLVEPNP_IPPE
     )
     found = []
+    # IPPE (Collins and Bartoli 2014) solves for a homography; the reprojection errors compared below need a refinement
     for rotation, position in zip(rotations, positions, strict=True):
         rotation, position = cv2.solvePnPRefineLM(  # noqa: PLW2901
             points, pixels, camera.matrix, camera.distortion, rotation.copy(), position.copy()
         )
         T = make_pose(cv2.Rodrigues(rotation)[0], np.ravel(position))
+        # A pose behind the camera may project to the same pixels, but forms no image
         if T[2, 3] > 0.0:
             found.append((compute_rms_px(T, view, board, camera), T))
     if not found:

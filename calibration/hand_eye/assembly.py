@@ -42,6 +42,7 @@ def make_result(
     initial_px = px = None
     if refine is None:
         fit, P = solve_least_squares(data, fit, C, kept.astype(float), free_scale=False)
+        # Row 0 is the scale's, which is not estimated here; those from 7 on are the board's
         covariance = P[1:7, 1:7]
     else:
         if methods:
@@ -69,6 +70,7 @@ def make_result(
         initial_px=initial_px,
         rms_mm=_rms(mm[kept]),
         rms_deg=_rms(deg[kept]),
+        # Weighted, as views differ in their number of corners
         rms_px=None if px is None or corners is None else float(np.sqrt(np.average(px[kept] ** 2, weights=corners))),
         holdout_mm=_rms(out_mm),
         holdout_deg=_rms(out_deg),
@@ -117,6 +119,7 @@ def _solve_methods(data: PoseData, kept: np.ndarray, scale: float) -> tuple[Meth
 
 def _mean_pose(Ts: np.ndarray) -> np.ndarray:
     T = Ts.mean(axis=0)
+    # A mean of rotation matrices is no rotation: the nearest one is their chordal mean
     U, _, Vt = np.linalg.svd(T[:3, :3])
     T[:3, :3] = U @ Vt
     return T

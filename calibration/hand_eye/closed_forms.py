@@ -70,9 +70,11 @@ def solve_park_martin(Ts_anchor_mount: np.ndarray, Ts_camera_board: np.ndarray) 
     A = inverse(Ts_anchor_mount[first]) @ Ts_anchor_mount[second]  # A X = X B
     B = Ts_camera_board[first] @ inverse(Ts_camera_board[second])
     alpha, beta = rotation_vectors(A[:, :3, :3]), rotation_vectors(B[:, :3, :3])
+    # Rotation by the Kabsch algorithm; the determinant excludes a reflection
     U, _, Vt = np.linalg.svd(alpha.T @ beta)
     T = np.eye(4)
     T[:3, :3] = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    # Position from (R_A − 1) p = R p_B − p_A of all pairs
     lever = (A[:, :3, :3] - np.eye(3)).reshape(-1, 3)
     offset = (B[:, :3, 3] @ T[:3, :3].T - A[:, :3, 3]).ravel()
     T[:3, 3] = np.linalg.lstsq(lever, offset, rcond=None)[0]
@@ -89,6 +91,7 @@ def estimate_initial_poses(
     """
     n = len(Ts_anchor_mount)
     rng = np.random.default_rng(0)
+    # All samples come first: without an outlier they are the best subset
     subsets = [np.arange(n)] + [rng.choice(n, min(_SUBSET, n), replace=False) for _ in range(_HYPOTHESES)]
     best: tuple[np.ndarray, np.ndarray, float] | None = None
     for subset in subsets:

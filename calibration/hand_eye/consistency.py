@@ -73,6 +73,7 @@ def solve_reweighted(
         C = compute_covariances(data, fit, noise)
         d2 = compute_squared_distances(compute_residuals(data, fit), C)
         scale = max(1e-9, inflation * float(np.median(d2)) / _MEDIAN)
+        # The biweight of Beaton and Tukey (1974)
         weights = np.clip(1.0 - d2 / (_CUTOFF * scale), 0.0, None) ** 2
         before, (fit, _) = fit, solve_least_squares(data, fit, C, weights, free_scale=True, rounds=1)
         if max(np.max(part) for part in pose_distances_mm_deg(before.T_mount_camera, fit.T_mount_camera)) < 1e-4:
@@ -88,9 +89,11 @@ def fit_robust(data: PoseData, fit: PoseFit, *, free_scale: bool = True) -> Robu
     """
     robust, d2 = solve_reweighted(data, fit, NoiseLevels())
     fit = robust if free_scale else replace(robust, scale=fit.scale)
+    # A first guess with the default noise, therefore with twice the cut-off; the tests below decide
     kept = d2 < _CUTOFF * max(1e-9, float(np.median(d2)) / _MEDIAN) * 2.0
     noise = NoiseLevels()
     tested: set[bytes] = set()
+    # A sample dropped may bring another one back: the loop ends when a set recurs
     while kept.tobytes() not in tested:
         tested.add(kept.tobytes())
         for _ in range(2):  # the residuals determine the noise, and the noise their weights
@@ -98,6 +101,7 @@ def fit_robust(data: PoseData, fit: PoseFit, *, free_scale: bool = True) -> Robu
             C = compute_covariances(data, fit, noise)
             fit, _ = solve_least_squares(data, fit, C, kept.astype(float), free_scale=free_scale)
         d2 = compute_squared_distances(*compute_leave_one_out(data, fit, C, kept, free_scale=free_scale))
+        # F instead of chi square, as the noise is estimated from the same samples
         limit = 6.0 * f_distribution.ppf(1.0 - _FALSE_ALARM, 6, max(3 * (int(kept.sum()) - 2), 3))
         kept = d2 < limit
     return RobustFit(fit=fit, noise=noise, kept=kept)
@@ -107,6 +111,7 @@ def detect_board_move(data: PoseData, fit: PoseFit) -> BoardMove | None:
     """Return the most likely move of the board in the sequence; None when no move explains the samples better."""
     noise = NoiseLevels()
     gain, best, index = _best_split(data, fit, noise)
+    # Default noise that is too large lowers the gain: the full limit applies after the noise is estimated
     if best is None or gain < 0.2 * _MIN_MOVE_GAIN:
         return None
     near = compute_squared_distances(compute_residuals(data, best), compute_covariances(data, best, noise)) < _CUTOFF
@@ -124,6 +129,7 @@ def detect_board_move(data: PoseData, fit: PoseFit) -> BoardMove | None:
 def _best_split(data: PoseData, fit: PoseFit, noise: NoiseLevels) -> tuple[float, PoseFit | None, int]:
     """Return the gain of a second board pose in squared distances, its fit, and its first sample."""
     _, d2 = solve_reweighted(data, fit, noise)
+    # Truncated, so that one outlier does not justify a second board pose
     one = np.minimum(d2, _CUTOFF).sum()
     gain, best, index = 0.0, None, 0
     for first in range(_MIN_GROUP, len(data) - _MIN_GROUP + 1):
@@ -143,6 +149,7 @@ def _best_split(data: PoseData, fit: PoseFit, noise: NoiseLevels) -> tuple[float
 def _medoid(boards: np.ndarray) -> np.ndarray:
     """Return the pose (4, 4) nearest to the others."""
     mm, deg = pose_distances_mm_deg(boards[:, None], boards[None])
+    # The median over the others keeps an outlier from moving the result
     return boards[np.argmin(np.median(mm + 5.0 * deg, axis=1))]
 
 

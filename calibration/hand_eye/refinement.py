@@ -44,7 +44,9 @@ def estimate_corner_noise_px(refine: Refinement, Ts_camera_board: np.ndarray) ->
     for view, T in zip(refine.views, Ts_camera_board, strict=True):
         points = transform_points(T, refine.board.corners_m[view.ids])
         square = np.sum((refine.camera.project(points) - view.pixels_px) ** 2)
+        # Two equations a corner, less the six unknowns of the view's own pose
         variances.append(square / max(2 * len(view.ids) - 6, 1))
+    # The median: one bad view shifts it only a little
     return max(float(np.sqrt(np.median(variances))), _MIN_CORNER_NOISE_PX)
 
 

@@ -70,6 +70,7 @@ def solve_hand_eye(
     data = _pose_data(Ts_base_flange, Ts_camera_board, setup, refine)
     names = _check_names(names, len(data))
     warnings = check_diversity(data.Ts_anchor_mount)
+    # Before the outliers are dropped: after a move all samples of one side are outliers to the other
     move = detect_board_move(data, make_initial_fit(data))
     used = np.ones(len(data), dtype=bool)
     if move is not None:
@@ -194,6 +195,7 @@ def _settle_scale(
     C = compute_covariances(data, robust.fit, robust.noise)
     _, P = solve_least_squares(data, robust.fit, C, robust.kept.astype(float), free_scale=True, rounds=1)
     difference, sd = robust.fit.scale - 1.0, float(np.sqrt(P[0, 0]))
+    # Four standard deviations are exceeded by chance once in 16,000 calibrations
     if abs(difference) <= WRONG_SCALE or abs(difference) < 4.0 * sd:
         return fit_robust(data, replace(robust.fit, scale=1.0), free_scale=False), []
     if refine is None:

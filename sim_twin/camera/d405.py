@@ -13,12 +13,15 @@ from hal.base.messages import Intrinsics
 INTRINSICS = Intrinsics(width=640, height=480, fx=393.0305, fy=392.6793, cx=312.918, cy=240.937)
 """The colour stream of a real unit at 640×480, taken as undistorted."""
 FRAME_PERIOD_S = 1.0 / 30.0
+# The D405's default in librealsense (d400-device.cpp); other D400 cameras have 1 mm
 DEPTH_UNIT_M = 1e-4
+# As librealsense reports it (`stereo_baseline` 18.0 mm)
 BASELINE_M = 0.018
 MIN_Z_M = 0.070
 """Nearer than this the stereo has no match at 640×480 (datasheet: 70 mm at 848×480; measured: fails below 70 mm)."""
 MAX_Z_M = 6.5535
 """Largest distance that fits 16 bits of 0.1 mm."""
+# The camera's processor computes disparities with five fractional bits (librealsense)
 DISPARITY_STEP_PX = 1.0 / 32.0
 DISPARITY_SD_PX = 0.08
 """Standard deviation of the matched disparity on textured surfaces (0.05 to 0.08 on real units)."""
@@ -46,6 +49,7 @@ def _gauss(bits: np.uint64) -> float:
     mask = np.uint64(0xFFFF)
     total = float(bits & mask) + float((bits >> np.uint64(16)) & mask)
     total += float((bits >> np.uint64(32)) & mask) + float(bits >> np.uint64(48))
+    # Four uniform numbers have a variance of 4 / 12 in sum: √3 makes it 1
     return (total / 65536.0 - 2.0) * 1.7320508
 
 
@@ -56,6 +60,7 @@ def _smooth_noise(height: int, width: int, key: np.uint64, radius: int) -> np.nd
     rows, columns = height + 2 * radius, width + 2 * radius
     along = np.empty((rows, width), np.float32)
     line = np.empty(columns, np.float32)
+    # A box filter is separable: first along the rows, then along the columns
     for v in range(rows):
         for u in range(columns):
             line[u] = _gauss(_hash(key + np.uint64(v * columns + u)))
@@ -70,6 +75,7 @@ def _smooth_noise(height: int, width: int, key: np.uint64, radius: int) -> np.nd
             total = np.float32(0.0)
             for k in range(size):
                 total += along[v + k, u]
+            # The sum of size² numbers of unit variance has the standard deviation `size`
             field[v, u] = total / size
     return field
 
@@ -114,6 +120,7 @@ def _measure(z: np.ndarray, key: np.uint64, pinhole: tuple[float, float, float, 
     noise = _smooth_noise(height, width, key, _CORRELATION_PX)
     visible = _visible_to_both(z, focal_baseline)
     out = np.zeros((height, width), np.float32)
+    # Pixels at the border lack the neighbours for the test of an edge
     for v in range(1, height - 1):
         for u in range(1, width - 1):
             zc = z[v, u]
@@ -123,6 +130,7 @@ def _measure(z: np.ndarray, key: np.uint64, pinhole: tuple[float, float, float, 
             for near in (z[v, u - 1], z[v, u + 1], z[v - 1, u], z[v + 1, u]):
                 low, high = min(low, near), max(high, near)
             if high - low > _EDGE_RATIO * zc:
+                # The upper 53 bits, as many as a float holds; the constant gives a stream apart from that of the noise
                 chance = float(_hash(key ^ np.uint64(v * width + u + 0x5DEECE66D)) >> np.uint64(11)) / 2.0**53
                 if chance < _EDGE_LOSS or _is_grazing(z, v, u, pinhole):
                     continue
@@ -161,6 +169,7 @@ def _add_colour_noise(colour: np.ndarray, key: np.uint64) -> np.ndarray:
 
 
 def _key(seed: int, sequence: int) -> np.uint64:
+    # SeedSequence mixes its words: neighbouring seeds and frames have unrelated noise
     return np.uint64(int(np.random.SeedSequence([seed, sequence]).generate_state(1, np.uint64)[0]))
 
 

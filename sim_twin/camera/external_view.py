@@ -59,6 +59,7 @@ def _draw_with_gl(model: mujoco.MjModel, data: mujoco.MjData, width: int, height
     option.geomgroup[list(_GROUPS)] = 1
     camera.lookat[:] = _LOOK_AT_M
     camera.distance, camera.azimuth, camera.elevation = _DISTANCE_M, _AZIMUTH_DEG, _ELEVATION_DEG
+    # Eight passes of up to 255 each fit 16 bits
     total, colour = np.zeros((height, width, 3), np.uint16), np.empty((height, width, 3), np.uint8)
     try:
         for offset in _spread(_PASSES):
@@ -73,6 +74,7 @@ def _draw_with_gl(model: mujoco.MjModel, data: mujoco.MjData, width: int, height
 
 def _spread(n: int) -> np.ndarray:
     """Return points (n, 2) that fill [−1, 1]² evenly: the R2 sequence (Roberts 2018)."""
+    # The plastic number, the real root of x³ = x + 1
     plastic = 1.32471795724474602596
     return 2.0 * ((0.5 + np.outer(np.arange(1, n + 1), [1 / plastic, 1 / plastic**2])) % 1.0) - 1.0
 
@@ -92,6 +94,7 @@ def _shift(scene: mujoco.MjvScene, offset: np.ndarray, height: int) -> None:
 
 def _draw_with_rays(model: mujoco.MjModel, data: mujoco.MjData, width: int, height: int) -> np.ndarray:
     focal = height / 2 / np.tan(np.deg2rad(model.vis.global_.fovy) / 2)
+    # Pixel centres are at whole numbers, so the image's middle is at half of its size less one
     intrinsics = Intrinsics(width=width, height=height, fx=focal, fy=focal, cx=(width - 1) / 2, cy=(height - 1) / 2)
     azimuth, elevation = np.deg2rad([_AZIMUTH_DEG, _ELEVATION_DEG])
     forward = np.array([*(np.cos(elevation) * np.array([np.cos(azimuth), np.sin(azimuth)])), np.sin(elevation)])

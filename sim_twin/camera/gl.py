@@ -81,11 +81,13 @@ class Canvas:
         except mujoco.FatalError as error:
             self._gl.free()
             raise CameraError(_no_egl(error), code="no_egl") from error
+        # MuJoCo draws into a window's buffer unless set otherwise, and EGL without a screen has none
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self.context)
         self._rect = mujoco.MjrRect(0, 0, width, height)
 
     def draw(self, scene: mujoco.MjvScene, colour: np.ndarray, depth: np.ndarray | None = None) -> None:
         """Draw `scene` into `colour` (H, W, 3) uint8 and `depth` (H, W) float32; the bottom row comes first."""
+        # A thread has one current context, and may have drawn on another canvas since
         self._gl.make_current()
         mujoco.mjr_render(self._rect, scene, self.context)
         mujoco.mjr_readPixels(colour, depth, self._rect, self.context)

@@ -52,6 +52,7 @@ class RayCaster:
             self._model, data, origin, rays.ravel(), self._groups, True, -1, geoms, ranges, normals.ravel(), n, _FAR_M
         )
         hit = geoms >= 0
+        # Rays have unit length, z = 1 before the normalisation: dividing gives the distance along the optical axis
         z_m = np.where(hit, ranges / self._lengths, 0.0).astype(np.float32)
         light = _AMBIENT + _DIFFUSE * np.clip(normals @ _TO_LIGHT, 0.0, 1.0)
         colour = np.where(hit[:, None], self._rgb[geoms] * light[:, None], _SKY)
@@ -82,6 +83,7 @@ class RayRenderer:
         if self._board is not None:
             visible = geoms == self._print
             ink = project_print(self._board, self._intrinsics, T_base_camera)[visible][:, None] / 255.0
+            # A product, so that the plate's shading remains under the print
             colour[visible] = np.round(ink * colour[visible])
         return View(colour=colour, z_m=z_m, mask=self._is_object[geoms])
 

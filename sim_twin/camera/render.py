@@ -71,6 +71,7 @@ class EglRenderer:
         # Software GL would take every core for itself; one leaves the others to the servo. Read when GL is loaded.
         os.environ.setdefault("LP_NUM_THREADS", "1")
         self._canvas = Canvas(model, width, height)
+        # Reversed depth: float32 is finest near 0, which offsets the coarseness of 1/z at a distance
         self._canvas.context.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR.value
         self._scene = mujoco.MjvScene(model, maxgeom=500)
         self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = False
@@ -108,6 +109,7 @@ class EglRenderer:
         self._scene.flags[by_number] = True
         self._canvas.draw(self._scene, self._ids, self._inverse_z)
         self._scene.flags[by_number] = False
+        # MuJoCo draws `segid` + 1, so that 0 is the background
         is_object = np.zeros(self._scene.ngeom + 1, np.bool_)
         for geom in self._scene.geoms[: self._scene.ngeom]:
             if geom.segid >= 0 and geom.objtype == mujoco.mjtObj.mjOBJ_GEOM:
@@ -129,5 +131,6 @@ def _decode(ids: np.ndarray, inverse_z: np.ndarray, is_object: np.ndarray) -> tu
         for u in range(width):
             if inverse_z[row, u] > 0.0:
                 z_m[v, u] = _NEAR_M * _FAR_M / (_NEAR_M + inverse_z[row, u] * (_FAR_M - _NEAR_M))
+            # The number's low byte is in red, the next one in green
             mask[v, u] = is_object[ids[row, u, 0] + 256 * ids[row, u, 1]]
     return z_m, mask

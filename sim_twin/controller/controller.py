@@ -39,6 +39,7 @@ MAX_TEACHING_S = 300.0
 _UNKNOWN = frozenset({Fsm.SETTRAJ, Fsm.TRAJECTORY, Fsm.NEXT})
 _STIFF = frozenset({Fsm.JOINTCTRL, Fsm.CARTESIAN}) | MOVES
 _FRESH_S = 0.02  # validity of the speed in a tracking command [s]; the vendor's was not measured
+# [rad/s, m/s]; the duration of a motion divides by it
 _MIN_SPEED = 1e-3
 _MAX_POSE = 100.0  # [rad, m]; poses beyond are garbage, and would overflow the inverse kinematics
 # Maximum change of a joint from the reference while tracking a pose [rad]: a larger one jumps to another branch.
@@ -96,6 +97,7 @@ class Controller:
             self._low_level = command.joints()
         elif self.fsm is Fsm.JOINTCTRL and command.track:
             joints = command.joints()
+            # Unlimited: the vendor's controller followed a target of 5.0 rad beyond joint 1's limit of 2.618
             self._target, self._speed, self._track_age_s = joints.q, joints.dq, 0.0
         elif self.fsm is Fsm.CARTESIAN and command.track:
             move = command.trajectory()
@@ -107,10 +109,12 @@ class Controller:
 
     def _enter(self, command: Command) -> None:
         state = command.state
+        # Out of a state without position control the arm is where it was moved to, not at the reference
         start = self._q if self.fsm in _STIFF else self.measured.q.copy()
         paths = self._plan(command, start) if state in MOVES else []
         low = command.joints() if state is Fsm.LOWCMD else self._low_level
         lesson = command.label() if state is Fsm.TEACH else ""
+        # A path needs two points
         if self.fsm is Fsm.TEACH and len(self._taught) > 1:
             self.recordings[self._lesson] = np.array(self._taught)
         # Nothing raises from here on.
@@ -179,6 +183,7 @@ class Controller:
             case Fsm.PASSIVE | Fsm.CALIBRATION:
                 commands = JointCommands(q=self.measured.q, kd=KD_PASSIVE)
             case Fsm.LOWCMD:
+                # Measured on the vendor's controller: 9 rad and 50 rad/s were limited, a torque of 700 Nm was not
                 q, dq = (
                     np.clip(self._low_level.q, z1.Q_MIN, z1.Q_MAX),
                     np.clip(self._low_level.dq, -z1.DQ_MAX, z1.DQ_MAX),
@@ -203,6 +208,7 @@ class Controller:
             path = self._paths[0]
             self._q, dq = path.sample(self._time_s)
             if self._time_s >= path.duration_s:
+                # The rest of this step belongs to the next path
                 self._time_s -= path.duration_s
                 del self._paths[0]
                 if not self._paths:
@@ -213,6 +219,7 @@ class Controller:
         step = np.clip(distance, -reach, reach)
         self._q = self._q + step
         speed = np.clip(self._speed, -TRACKING_SPEED, TRACKING_SPEED) if self._track_age_s <= _FRESH_S else _NO_SPEED
+        # At the target the client's speed is fed forward, on the way to it that of the rate limit
         return np.where(step == distance, speed, step / dt_s)
 
     def _record(self) -> None:

@@ -18,6 +18,7 @@ from hal.z1_protocol.records import JointStates, MotorLink, ProtocolError
 from sim_twin.controller.motors import Motors
 from sim_twin.model.world import World
 
+# Joint 2 has two motors
 _N_MOTORS_ARM = 7
 
 

@@ -59,6 +59,7 @@ class Motors:
         self._command_age_s = np.zeros(z1.N_JOINTS)
         self._released = np.zeros(z1.N_JOINTS, dtype=bool)
         self._ticks = 0
+        # One period before the world's start, as the first acceleration divides by the time since the last one
         self._measured_s = -_PERIOD_S
         self._measured = JointStates(q=world.read_arm()[0])
 
@@ -74,6 +75,7 @@ class Motors:
     def handle_command(self, commands: JointCommands) -> None:
         """Forward commands of all seven joints, or of the six without the gripper, to the connected motors."""
         self.awake = True
+        # The usual case, 250 times a second, without the copies below
         if len(commands.q) == z1.N_JOINTS and not self._released.any() and not (self.error.any() or self.link.any()):
             self._commands, self._command_age_s[:] = commands, 0.0
             self._drive(commands)
@@ -101,6 +103,7 @@ class Motors:
         """Advance the temperatures by `dt_s` [s] under the present torques."""
         effort = np.abs(self.world.read_arm()[2] / _MOTORS)[:, None] / _MOTOR_TAU_MAX
         end_c = AMBIENT_C + HEATING_K * effort**2
+        # The exact solution of the first-order lag; `expm1` keeps the digits of a short step
         self.temperature_c += (end_c - self.temperature_c) * -np.expm1(-dt_s / HEATING_S)
         self.error[(self.temperature_c >= OVERHEAT_C) & _EXISTS] |= np.uint8(MotorError.OVERHEAT)
 
@@ -115,6 +118,7 @@ class Motors:
             dq=dq,
             ddq=(dq - last.dq) / max(now_s - self._measured_s, _PERIOD_S),
             tau=tau,
+            # A motor's record holds the temperature in one signed byte
             temperature_c=np.clip(np.rint(self.temperature_c), -128, 127).astype(np.int8),
             error=self.error.copy(),
             link=self.link.copy(),
@@ -144,6 +148,7 @@ class Motors:
                 kp=np.where(released, 0.0, commands.kp),
                 kd=np.where(released, KD_PASSIVE, commands.kd),
             ),
+            # A released joint is damped, so its motors keep their limit
             np.where(ratio > 0.0, ratio, 1.0) * z1.TAU_MAX,
         )
 

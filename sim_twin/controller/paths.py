@@ -93,11 +93,13 @@ def plan_arc_path(
     if size < _MIN_TRIANGLE_M2:
         return None
     ab, ac = b - a, c - a
+    # Circumcentre of the triangle a, b, c
     centre = a + (np.cross(normal, ab) * (ac @ ac) + np.cross(ac, normal) * (ab @ ab)) / (2.0 * size**2)
     radius = float(np.linalg.norm(a - centre))
     x_axis = (a - centre) / radius
     y_axis = np.cross(normal / size, x_axis)
     middle, end = (float(np.arctan2((p - centre) @ y_axis, (p - centre) @ x_axis)) % (2 * np.pi) for p in (b, c))
+    # The middle posture belongs to where the arc passes its point, not to half of the arc
     rotation = Slerp([0.0, middle / end, 1.0], Rotation.from_matrix([pose[:3, :3] for pose in poses]))
 
     def position(u: float) -> np.ndarray:
@@ -117,6 +119,7 @@ def _solve_curve(
     points[:, z1.N_ARM] = np.linspace(start[z1.N_ARM], gripper, steps + 1)
     for i in range(1, steps + 1):
         T = make_pose(curve.rotation(i / steps).as_matrix(), curve.position(i / steps))
+        # From the solution before, which keeps the arm in one branch
         q = kinematics.inverse(T, points[i - 1, : z1.N_ARM], _MAX_CHANGE_RAD)
         if q is None:
             return None

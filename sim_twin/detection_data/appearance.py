@@ -32,6 +32,7 @@ def apply_twin_appearance(renderer: SceneRenderer) -> None:
     model.geom_rgba[renderer.arm_geoms] = renderer.arm_rgba
     model.light_active[:] = [1] + [0] * (LIGHTS - 1)
     model.light_type[0] = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
+    # 1.27 is the direction's length: the compiler, which would divide by it, has run before
     model.light_pos[0], model.light_dir[0] = [-0.3, -1.2, 2.2], np.array([0.35, 0.7, -1.0]) / 1.27
     model.light_diffuse[0], model.light_specular[0] = [0.62, 0.60, 0.56], [0.25] * 3
     model.vis.headlight.ambient, model.vis.headlight.diffuse = [0.30, 0.30, 0.32], [0.25] * 3
@@ -120,6 +121,7 @@ def _randomize_lights(model: mujoco.MjModel, rng: np.random.Generator) -> None:
         aim = np.array([0.5, 0.0, 0.0]) + rng.normal(0.0, 0.15, 3) - place
         model.light_pos[number], model.light_dir[number] = place, aim / np.linalg.norm(aim)
         model.light_cutoff[number], model.light_exponent[number] = rng.uniform(40, 80), rng.uniform(0, 8)
+        # Several lights are weaker each, so that the image does not saturate
         strength = rng.uniform(0.2, 0.9) / np.sqrt(count)
         model.light_diffuse[number] = strength * rng.uniform(0.8, 1.0, 3)
         model.light_specular[number] = [rng.uniform(0.0, 0.5)] * 3

@@ -14,6 +14,7 @@ def augment_image(colour: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     A third of the pictures, if not too dark, only get the little noise of a good exposure. Geometry stays: masks
     remain exact.
     """
+    # Every eighth pixel is enough for a mean
     if rng.random() < 0.33 and colour[::8, ::8].mean() > _DARK:
         return _with_noise(colour.astype(np.float32), rng.uniform(0.0, 2.5), rng)
     picture = _expose(colour, rng)
@@ -56,6 +57,7 @@ def _motion_blur(picture: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     kernel = np.zeros((length, length), np.float32)
     angle, middle = rng.uniform(0, np.pi), (length - 1) / 2
     along = middle * np.array([np.cos(angle), np.sin(angle)])
+    # The kernel is a line through its middle, so that masks stay in place
     ends = [tuple(round(a) for a in middle + side * along) for side in (-1, 1)]
     cv2.line(kernel, ends[0], ends[1], 1.0)
     return cv2.filter2D(picture, -1, kernel / kernel.sum())

@@ -40,6 +40,7 @@ def _random_joints(rng: np.random.Generator) -> np.ndarray:
     else:
         q[0], q[4] = rng.normal(0.0, 0.35), rng.normal(0.0, 0.25)
         q[1], q[2] = rng.uniform(0.7, 2.6), rng.uniform(-2.5, -0.2)
+        # Joints 2 to 4 turn about parallel axes: their sum is the pitch of the nose
         q[3] = rng.normal(0.25, 0.3) - q[1] - q[2]
         turned = rng.random()
         q[5] = np.pi / 2 + rng.normal(0.0, 0.2) - (np.pi if turned < 0.12 else 0.0)
@@ -73,8 +74,10 @@ def _choose_target(renderer: SceneRenderer, T_base_camera: np.ndarray, rng: np.r
     u, v = rng.uniform(0.08, 0.92) * i.width, rng.uniform(0.15, 0.85) * i.height
     ray = T_base_camera[:3, :3] @ i.deproject(np.array([u]), np.array([v]), np.ones(1))[0]
     place = T_base_camera[:3, 3]
+    # A nearly level ray meets the table far beyond its edge
     if abs(ray[2]) < 0.02:
         return None
+    # 75 mm is half the height of the benchmark's box and cylinder
     centre = place + (0.075 - place[2]) / ray[2] * ray
     depth = float((centre - place) @ T_base_camera[:3, 2])
     on_table = -0.2 < centre[0] < 0.95 and abs(centre[1]) < 0.55
@@ -176,6 +179,7 @@ def _fits(
     by_wrist: bool,
 ) -> bool:
     """True when the object is on the table, clear of lens, gripper and the other objects' middles."""
+    # The table ends at x = −0.30 m and 1.00 m, and at y = ±0.60 m
     if not (-0.25 < pose[0, 3] < 0.97 and abs(pose[1, 3]) < 0.57):
         return False
     if any(np.linalg.norm(pose[:3, 3] - other[:3, 3]) < 0.085 for other in others):

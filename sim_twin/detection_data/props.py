@@ -121,6 +121,7 @@ def _make_bottle(rng: np.random.Generator) -> tuple[Part, ...]:
     neck = rng.uniform(0.28, 0.48) * radius
     shoulder, collar = rng.uniform(0.58, 0.76), rng.uniform(0.82, 0.90)
     label = sorted(rng.uniform(0.15, 0.55, 2))
+    # A part needs a height: the profile must rise from point to point
     end = min(max(label[1], label[0] + 0.05), shoulder - 0.005)
     heights = [0.0, 0.02, label[0], end, shoulder, collar, rng.uniform(0.92, 0.95), 1.0]
     cap = neck * rng.uniform(1.0, 1.25)
@@ -175,6 +176,7 @@ def _make_mug(rng: np.random.Generator) -> Prop:
 
 def _make_ring(rng: np.random.Generator) -> Prop:
     radius, thick, n = rng.uniform(0.025, 0.06), rng.uniform(0.005, 0.012), 14
+    # Longer than an nth of the circle by a third: pointed ends overlap, and the ring has no gaps
     piece = _part("ellipsoid", (thick, 1.35 * np.pi * radius / n, thick))
     turns = [2 * np.pi * k / n for k in range(n)]
     poses = [_at(x=radius * np.cos(a), y=radius * np.sin(a), about=2, angle=a) for a in turns]

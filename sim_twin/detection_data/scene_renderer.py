@@ -64,6 +64,7 @@ class SceneRenderer:
         self.arm_geoms = np.flatnonzero(np.isin(self.model.geom_group, (GROUP_ARM, GROUP_VISUAL)))
         self.arm_rgba = self.model.geom_rgba[self.arm_geoms].copy()
         self.intrinsics = intrinsics
+        # As in `EglRenderer`: Mesa reads it when GL is loaded
         os.environ.setdefault("LP_NUM_THREADS", "1")
         self._canvas = Canvas(self.model, intrinsics.width, intrinsics.height)
         self._scene = mujoco.MjvScene(self.model, maxgeom=_GEOMS_DRAWN)
@@ -148,6 +149,7 @@ class SceneRenderer:
         """
         self._update_scene(camera, arm, shadows)
         self._canvas.draw(self._scene, self._pixels)
+        # OpenGL's first row is the bottom one
         return np.ascontiguousarray(self._pixels[::-1])
 
     def draw_instances(self, camera: str, arm: str) -> np.ndarray:
@@ -160,6 +162,7 @@ class SceneRenderer:
         owner = np.full(self.model.ngeom, -1, np.int16)
         for number, instance in enumerate(self.props):
             owner[instance.geoms] = number
+        # Red and green hold a geom's number, 16 bits
         table = np.full(65536, -1, np.int16)
         for geom in self._scene.geoms[: self._scene.ngeom]:
             if geom.segid >= 0 and geom.objtype == mujoco.mjtObj.mjOBJ_GEOM:
@@ -177,6 +180,7 @@ class SceneRenderer:
         self._option.geomgroup[[GROUP_SCENE, *shown]] = 1
         self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = shadows
         self._camera.fixedcamid = self.model.camera(camera).id
+        # Poses of mocap bodies take effect with the kinematics
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_camlight(self.model, self.data)
         category = mujoco.mjtCatBit.mjCAT_ALL.value
@@ -214,6 +218,7 @@ def _add_materials(spec: mujoco.MjSpec) -> None:
     for name in ("floor", "table"):
         spec.add_texture(name=name, type=kind.mjTEXTURE_2D, builtin=flat, width=FLAT_PX, height=FLAT_PX)
         spec.add_material(name=name, texrepeat=[3, 3]).textures[rgb] = name
+    # MuJoCo stores a cube's six square sides one below the other
     spec.add_texture(name="sky", type=kind.mjTEXTURE_SKYBOX, builtin=flat, width=FLAT_PX, height=6 * FLAT_PX)
     for number in range(SKINS):
         name = f"skin_{number}"

@@ -170,6 +170,7 @@ def project_outline(corners: list[np.ndarray], T_base_camera: np.ndarray, intrin
             return None
         pixels = intrinsics.project(in_camera)
         hull = cv2.convexHull(((pixels + np.array([width, height])) / 2).astype(np.float32))
+        # Corners near the lens project far away, where OpenCV's integers would overflow
         cv2.fillConvexPoly(canvas, np.round(np.clip(hull, -9999, 9999)).astype(np.int32), 1)
     return canvas.astype(bool)
 
@@ -227,6 +228,7 @@ def _is_too_occluded(
         return True
     if by_shape and instance.prop.kind == "bottle" and not _shows_mark(renderer, instance, mask, T_base_camera):
         return True
+    # An outline at half size has a quarter of the pixels
     return visible < MIN_VISIBLE_RATIO * 4 * int(np.count_nonzero(whole)) and visible < _LARGE_RATIO * mask.size
 
 

@@ -85,6 +85,7 @@ def _wood(rng: np.random.Generator, size: int) -> np.ndarray:
 
 def _speckle(rng: np.random.Generator, size: int) -> np.ndarray:
     field = cv2.GaussianBlur(rng.standard_normal((size, size), dtype=np.float32), (0, 0), rng.uniform(0.6, 4.0))
+    # A sixteenth of the pixels is enough for a quantile
     return (field > np.quantile(field[::4, ::4], rng.uniform(0.5, 0.95))).astype(np.float32)
 
 

@@ -37,11 +37,13 @@ class ChildProcess:
         ours, theirs = Pipe()
         self._name, self._connection, self._lock = name, ours, threading.Lock()
         self._process = subprocess.Popen(
+            # -P: no module of the working directory takes the place of an installed one
             [sys.executable, "-P", "-m", "sim_twin.drop_in.child_process", str(theirs.fileno())],
             pass_fds=(theirs.fileno(), *memory),
             stdin=subprocess.DEVNULL,
             start_new_session=True,  # Ctrl-C reaches the parent only, which then ends the child in order
         )
+        # With a second copy open here, the connection would not break when the child ends
         theirs.close()
         self.close: Callable[[], None] = weakref.finalize(self, _end, ours, self._process)
         """End the process. Harmless when it has ended."""

@@ -137,6 +137,7 @@ class WireProcess(SceneView):
 def load_model(fd: int) -> mujoco.MjModel:
     """Return the model in the file behind `fd`."""
     size = os.fstat(fd).st_size
+    # Not `read`: processes that inherited a descriptor share its position
     return pickle.loads(os.pread(fd, size, 0))
 
 
@@ -180,6 +181,7 @@ def serve(
     twin = make_twin(scene, wire, q_start, shared.injected_faults)
     world = twin.world
     shared.start_height_m = world.start_height_m
+    # Before readiness is reported below: the parent may read the poses and the model at once
     shared.publish(*world.poses())
     with open(model, "wb", closefd=False) as file:
         pickle.dump(world.model, file)

@@ -80,6 +80,7 @@ class TwinSource:
         """Free the renderer and its thread until the next `expose`."""
         thread, self._thread = self._thread, None
         if thread is not None:
+            # In the renderer's own thread, to which its OpenGL context belongs
             thread.submit(self._close_renderer).result()
             thread.shutdown()
 
@@ -128,6 +129,7 @@ class TwinSource:
     def _render_right(self, renderer: WristRenderer, data: mujoco.MjData) -> View:
         number = camera_id(self.world.model)
         x_axis = data.cam_xmat[number].reshape(3, 3)[:, 0]
+        # In the snapshot only, whose cameras are computed again from the joints for each exposure
         data.cam_xpos[number] += BASELINE_M * x_axis
         return renderer.render(data)
 
@@ -147,6 +149,7 @@ class TwinSource:
             image = cv2.convertScaleAbs(image, alpha=request.brightness)
         if not self.world.config.noise:
             return image
+        # Three imagers a frame: no two images share their noise
         return d405.measure_colour(np.ascontiguousarray(image), self.world.config.seed, 3 * request.number + imager)
 
 
@@ -165,6 +168,7 @@ class Optics:
     def __init__(self, calibration: D405Calibration, width: int, height: int) -> None:
         pinhole = self.depth = calibration.depth(width, height)
         u, v = _colour_in_depth(calibration, width, height)
+        # One more pixel on each side for the bilinear interpolation of the colour image
         left, top = (int(np.floor(min(a.min(), 0.0))) - 1 for a in (u, v))
         right, bottom = (int(np.ceil(max(a.max(), n))) + 1 for a, n in ((u, width), (v, height)))
         self.wide = Intrinsics(

@@ -92,6 +92,7 @@ def make_wire_sim_rig(scene: SceneConfig | None = None, mode: Z1Mode = Z1Mode.TR
 
 def free_ports() -> tuple[int, int]:
     """Return two free UDP ports of the loopback interface."""
+    # Both are open at once, or the system might give the same port twice
     with socket.socket(type=socket.SOCK_DGRAM) as one, socket.socket(type=socket.SOCK_DGRAM) as other:
         one.bind((_LOOPBACK, 0))
         other.bind((_LOOPBACK, 0))

@@ -30,6 +30,7 @@ def make_memory(size: int) -> int:
     if hasattr(os, "memfd_create"):
         fd = os.memfd_create("z1-twin")
     else:
+        # memfd_create is Linux's alone
         with tempfile.TemporaryFile() as file:
             fd = os.dup(file.fileno())
     os.ftruncate(fd, size)
@@ -83,6 +84,7 @@ class SharedWorld:
         Raises:
             HalError: the publisher ended during a write.
         """
+        # A seqlock: the read is repeated when a write was in progress, or happened meanwhile
         for _ in range(_MAX_TRIES):
             before = int(self._version)
             time_s, qpos = float(self._time_s), self._qpos[: int(self._nq)].copy()

@@ -132,6 +132,7 @@ class WireServer:
         host, port = self.config.host, self.config.port
         inlet = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
+            # `_receive` reads until nothing is left in the queue
             inlet.setblocking(False)
             inlet.bind((host, port))
         except OSError as error:
@@ -183,6 +184,7 @@ class WireServer:
         self._receive(inlet)
 
     def _receive(self, inlet: socket.socket) -> None:
+        # Bounded, so that a flood of datagrams does not keep the world from its step
         for _ in range(_MAX_DATAGRAMS):
             try:
                 size, sender = inlet.recvfrom_into(self._buffer)

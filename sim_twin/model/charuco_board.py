@@ -22,6 +22,7 @@ MARGIN_M = 0.008
 
 _INK_M = 2e-5  # height of the print above the plate, so that it is drawn in front of it
 _X_M, _Y_M = (0.25, 0.70), (-0.30, 0.30)
+# Per axis: bilinear interpolation takes four texels, and would alias where the image is smaller than the texture
 _SUPERSAMPLING = 3
 
 
@@ -92,6 +93,7 @@ def add_board(spec: mujoco.MjSpec, board: BoardSpec) -> None:
     texture.data = np.ascontiguousarray(np.repeat(board.image[..., None], 3, axis=2)).tobytes()
     # No gloss, and one copy of the image over the whole face
     material = spec.add_material(name=PRINT_GEOM, specular=0.0, shininess=0.0, texuniform=False, texrepeat=[1, 1])
+    # MuJoCo binds textures to materials, and only those to geoms
     material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = PRINT_GEOM
     # MuJoCo maps a texture onto a box with its right along x and its top along y
     T_base_board = board.T_base_board()

@@ -82,6 +82,7 @@ def load_visual_mesh(link: str) -> tuple[np.ndarray, np.ndarray]:
     cells = np.round(mesh.vertices / _VISUAL_GRID_M).astype(np.int64)
     _, first, cell_of = np.unique(cells, axis=0, return_index=True, return_inverse=True)
     faces = cell_of.reshape(-1)[mesh.faces]
+    # Triangles with two corners in one cell have no area left
     flat = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
     return np.asarray(mesh.vertices)[first], faces[~flat]
 
@@ -105,6 +106,7 @@ def _clip(mesh: trimesh.Trimesh, region: Region) -> np.ndarray:
                 vertices, faces, _ = trimesh.intersections.slice_faces_plane(
                     vertices, faces, normal, bound * np.eye(3)[axis]
                 )
+                # Vertices that were cut off stay in the list, and would count in the hull
                 used, inverse = np.unique(faces, return_inverse=True)
                 vertices, faces = vertices[used], inverse.reshape(-1, 3)
     return vertices

@@ -46,9 +46,11 @@ class Fixture:
         for index in np.flatnonzero((bodies == self._object).any(axis=1)):
             first, second = bodies[index]
             other = int(second if first == self._object else first)
+            # Body 0 is the world with the table, whose support is no push
             if other == 0:
                 continue
             mujoco.mj_contactForce(model, data, int(index), wrench)
+            # MuJoCo stores the contact frame's axes in rows, the normal first
             force = data.contact.frame[index].reshape(3, 3).T @ wrench[:3]
             # The contact force acts on the second geom along the frame's axes.
             forces[other] = forces.get(other, np.zeros(3)) + (force if second == self._object else -force)

@@ -139,6 +139,7 @@ def _check_size(path: Path, extents: np.ndarray, scale: float) -> None:
 
 def _decompose(mesh: trimesh.Trimesh, content: bytes) -> list[np.ndarray]:
     """Return the corners (M, 3) of convex parts that together are the mesh, in the file's units; cached by content."""
+    # In the key, as other settings give other parts of the same mesh
     settings = repr((version("coacd"), _COACD, _COACD_OPEN)).encode()
     path = cache_folder() / f"{hashlib.sha256(settings + content).hexdigest()}.npz"
     if path.exists():
@@ -152,6 +153,7 @@ def _decompose(mesh: trimesh.Trimesh, content: bytes) -> list[np.ndarray]:
     parts = coacd.run_coacd(coacd.Mesh(mesh.vertices, mesh.faces), **_COACD, **more)
     hulls = [np.asarray(vertices, dtype=np.float64) for vertices, _ in parts]
     path.parent.mkdir(parents=True, exist_ok=True)
+    # Renamed when complete: several processes may decompose the same mesh at once
     partial = path.with_suffix(f".{os.getpid()}.partial")
     with partial.open("wb") as file:
         np.savez(file, allow_pickle=False, **{f"hull_{k:02}": hull for k, hull in enumerate(hulls)})
@@ -169,6 +171,7 @@ def _assemble(path: Path, hulls: list[np.ndarray], mass_kg: float) -> GraspObjec
         raise MeshError(
             f"mesh: {path} is flat (0 parts with a volume, allowed 1 or more). Give it a thickness.", code="mesh_flat"
         )
+    # CoACD cuts by planes: its parts hardly overlap, so that their volumes add up
     total = sum(body.volume for body in bodies)
     parts = tuple(
         Part(
@@ -211,6 +214,7 @@ def _has_feet(parts: tuple[Part, ...], centre: np.ndarray) -> bool:
         base = ConvexHull(feet)
     except (QhullError, ValueError):
         return False  # a point or an edge
+    # Qhull's equations give the distance from each edge, negative inside
     return bool((base.equations[:, :2] @ centre[:2] + base.equations[:, 2] < -_FOOT_HEIGHT_M).all())
 
 
@@ -229,10 +233,12 @@ def _settled_tilt_rad(grasp_object: GraspObject, axis: np.ndarray) -> float:
     )
     start = np.eye(4)
     start[:3, :3] = Rotation.from_rotvec(_PUT_DOWN_RAD * axis).as_matrix()
+    # Put down, not dropped: the lowest corner starts on the table
     start[2, 3] = -float((grasp_object.corners() @ start[2, :3]).min())
     add_object(spec, grasp_object, start)
     model = spec.compile()
     data = mujoco.MjData(model)
     mujoco.mj_step(model, data, nstep=round(1.0 / _TRIAL_STEP_S))
+    # Vertical component of the object's own z axis, the cosine of its lean
     up = float(data.body(OBJECT_BODY).xmat[8])
     return float(np.arccos(np.clip(up, -1.0, 1.0)))

@@ -76,6 +76,7 @@ def add_object(
             rgba=part.rgba,
             contype=BIT_SCENE,
             conaffinity=BIT_SCENE | BIT_BASE | BIT_GRIPPER,
+            # MuJoCo's condim 4 adds torsional friction: without it nothing resists a turn about a contact's normal
             condim=4,
             friction=_FRICTION,
             solref=CONTACT_SOLREF,

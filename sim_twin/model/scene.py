@@ -113,6 +113,7 @@ class SceneConfig:
         _check_range("arm_latency_s", self.arm_latency_s, _ARM_LATENCY_S, "s")
         for name in ("seed", "mount_seed"):
             seed = getattr(self, name)
+            # A bool is an int in Python
             if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**32:
                 raise InvalidValueError(
                     f"scene: {name} is invalid ({seed!r}, allowed whole numbers from 0 to {2**32 - 1}). Give such "
@@ -143,6 +144,7 @@ class SceneConfig:
 
     def T_flange_camera(self) -> np.ndarray:
         """Return the camera's true pose on the flange (4, 4)."""
+        # Normal vectors brought to unit length have no preferred direction
         shift, turn = np.random.default_rng(self.mount_seed).normal(size=(2, 3))
         pose = z1.T_FLANGE_CAMERA.copy()
         pose[:3, 3] += self.mount_error_m * shift / np.linalg.norm(shift)
@@ -181,12 +183,14 @@ def neighbour_body(number: int) -> str:
 
 def build_model(config: SceneConfig) -> mujoco.MjModel:
     """Return the model of arm, table, object and, if there are any, neighbours and board; it is the caller's own."""
+    # A copy, as each world writes its servos' gains into its model
     return copy.copy(_compile(config))
 
 
 @lru_cache(maxsize=2)  # an episode builds its scene several times; compiling the arm's meshes takes 0.2 s
 def _compile(config: SceneConfig) -> mujoco.MjModel:
     spec = mujoco.MjSpec()
+    # The URDF's limits are in radians; MuJoCo's compiler takes degrees by default
     spec.compiler.degree = False
     _set_options(spec)
     _add_surroundings(spec)
@@ -201,6 +205,7 @@ def _compile(config: SceneConfig) -> mujoco.MjModel:
         weld.name1, weld.name2 = OBJECT_BODY, "world"
         weld.data = [0.0] * 10 + [1.0, 0.0]  # anchor and relative pose left to the compiler; torque scale 1 m
     model = spec.compile()
+    # On every geom: MuJoCo uses one of the two in contact, by priority or the larger
     model.geom_friction *= config.friction_factor
     return model
 
@@ -208,6 +213,7 @@ def _compile(config: SceneConfig) -> mujoco.MjModel:
 def _set_options(spec: mujoco.MjSpec) -> None:
     option = spec.option
     option.timestep = PHYSICS_PERIOD_S
+    # Implicit in velocities: joint damping and the servos' derivative gains stay stable at steps of 1 ms
     option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     # Held objects creep by the softness of friction: stiff friction rows slow that, the no-slip pass ends it (0.06 mm
     # and 0.03° in 3 s, against 1.3 mm and 2.6° without).

@@ -61,6 +61,7 @@ class SceneView(ABC):
         copy = into if into is not None else mujoco.MjData(self.model)
         copy.time, copy.qpos[:] = self.poses()
         mujoco.mj_kinematics(self.model, copy)
+        # MuJoCo computes cameras and lights after the centres of mass, which they may track
         mujoco.mj_comPos(self.model, copy)
         mujoco.mj_camlight(self.model, copy)
         return copy

@@ -45,6 +45,7 @@ class World(SceneView):
         for _ in range(_SETTLE_STEPS):
             self.step()
         self._steps, self.data.time = 0, 0.0
+        # mj_step ends with the integration: without this, poses and contacts would be those of the step before
         mujoco.mj_forward(self.model, self.data)
         self.start_height_m = self.lowest_m()
 
@@ -68,6 +69,7 @@ class World(SceneView):
 
     def advance_to(self, t_s: float) -> None:
         """Step until `time_s >= t_s` [s]."""
+        # Times are whole steps times the period, up to rounding
         while self.time_s < t_s - 1e-9:
             self.step()
 
@@ -100,6 +102,7 @@ class World(SceneView):
         """
         kp, kd = np.clip(kp, 0.0, KP_MOTOR_MAX), np.clip(kd, 0.0, KD_MOTOR_MAX)
         with self._lock:
+            # The vendor's controller carries the weight by its own torque command
             self._set_servos(kp, kd, 0.0, tau_max)
             self.data.ctrl[:] = np.clip(tau + kp * q + kd * dq, -_CTRL_MAX, _CTRL_MAX)
 
@@ -115,6 +118,7 @@ class World(SceneView):
         """Return positions [rad], velocities [rad/s] and motor torques [Nm], each (7,)."""
         with self._lock:
             n = z1.N_JOINTS
+            # qfrc_actuator includes gravity compensation, since the joints have `actgravcomp`
             return self.data.qpos[:n].copy(), self.data.qvel[:n].copy(), self.data.qfrc_actuator[:n].copy()
 
     def poses(self) -> tuple[float, np.ndarray]:

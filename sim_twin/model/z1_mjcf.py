@@ -120,6 +120,7 @@ def _set_inertia(body: mujoco.MjsBody, inertia: pin.Inertia) -> None:
     body.explicitinertial = True
     body.mass = round(inertia.mass, _DECIMALS)
     body.ipos = inertia.lever.round(_DECIMALS)
+    # MuJoCo's order is the diagonal first
     (ixx, ixy, ixz), (_, iyy, iyz), (_, _, izz) = inertia.inertia
     body.fullinertia = [round(float(value), _DECIMALS) for value in (ixx, iyy, izz, ixy, ixz, iyz)]
 
@@ -161,6 +162,7 @@ def _add_geoms(spec: mujoco.MjSpec, body: mujoco.MjsBody, name: str) -> None:
     vertices, faces = load_visual_mesh(name)
     jaw = name in JAW_LINKS
     colour = "jaw" if jaw else "dark" if name in ("link00", "link04", "link06") else "link"
+    # MuJoCo's volume inertia needs a watertight mesh; this one is for rendering, and the body's own inertia counts
     visual = spec.add_mesh(name=f"{name}_visual", inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL)
     visual.uservert, visual.userface = vertices.ravel(), faces.ravel()
     body.add_geom(
@@ -183,7 +185,9 @@ def _add_geoms(spec: mujoco.MjSpec, body: mujoco.MjsBody, name: str) -> None:
             group=GROUP_ARM,
             contype=BIT_GRIPPER if is_gripper else BIT_BASE,
             conaffinity=BIT_SCENE | (BIT_BASE if is_gripper else BIT_GRIPPER),
+            # Torsional and rolling friction (MuJoCo's condim 6) where something is held
             condim=6 if jaw else 3,
+            # MuJoCo takes the friction of the geom with the higher priority, here the rubber's
             priority=1 if jaw else 0,
             friction=JAW_FRICTION if jaw else (0.3, 0.005, 0.0001),
             solref=CONTACT_SOLREF,

@@ -66,6 +66,7 @@ def run_tasks_on_ray(tasks: Sequence[Task], address: str) -> Iterator[list[Row]]
 
 
 def _iterate_completed(ray: Any, tasks: Sequence[Task], ahead: int) -> Iterator[list[Row]]:
+    # One core a task, as each worker is limited to one thread
     remote = ray.remote(num_cpus=1)(_run_on_worker)
     waiting = iter(tasks)
     running = [remote.remote(task) for task in islice(waiting, ahead)]

@@ -32,6 +32,7 @@ def draw_neighbours(scene: SceneConfig, count: int, names: Sequence[str], seed: 
     Raises:
         RuntimeError: no place was found.
     """
+    # A stream of its own: the camera's noise has the bare seed
     rng = np.random.default_rng([seed, 0xC1])
     order = [names[int(k) % len(names)] for k in rng.permutation(max(count, len(names)))]
     pose = scene.T_base_object()

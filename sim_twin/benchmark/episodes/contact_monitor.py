@@ -94,11 +94,13 @@ class ContactMonitor:
         max_force_n, wrench = 0.0, np.empty(6)
         for index in np.flatnonzero(on_table):
             mujoco.mj_contactForce(model, data, int(index), wrench)
+            # The first three entries are the force, the others the torque
             max_force_n = max(max_force_n, float(np.linalg.norm(wrench[:3])))
         return max_force_n
 
 
 def _displacement(start: np.ndarray, now: np.ndarray) -> tuple[float, float]:
     """Return displacement [m] of the origin and turn [rad] of the z axis between two poses (4, 4)."""
+    # Rounding may take the product of two unit vectors beyond 1
     turned_rad = float(np.arccos(np.clip(now[:3, 2] @ start[:3, 2], -1.0, 1.0)))
     return float(np.linalg.norm(now[:3, 3] - start[:3, 3])), turned_rad

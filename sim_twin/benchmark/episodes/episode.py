@@ -144,6 +144,7 @@ def _execute_attempts(
         attempts.append(replace(attempt, outcome=outcome))
         if outcome.mode not in RETRIED or len(attempts) == top_k:
             return attempts, ""
+        # Another seed: a retry is to have other candidates
         decider = make_grasp_selector(scenario, scenario.draw_seed + len(attempts))
         try:
             robot.withdraw(attempt.plan, outcome, decider.config.jaw_home)

@@ -143,6 +143,7 @@ class EpisodeRobot:
             MotionError, HalError: the arm does not get there.
         """
         if outcome.mode is Mode.SLIPPED:
+            # The way back is the way that was checked for collisions
             for motion in (plan.lift, plan.close, plan.approach):
                 self._move_to(motion.q[-1])
                 self._executor.execute(_reversed(motion))
@@ -167,8 +168,10 @@ class EpisodeRobot:
         for motion in (plan.lift, carry_motion):
             executor.execute(motion)
             executor.settle()
+        # Success counts the heights of the last second alone
         watch.clear()
         executor.execute(hold(carry_motion.q[-1], HOLD_S))
+        # In the frame of the stationary jaw the arm's own motion does not count as slip
         known["slip_m"] = float(np.linalg.norm(watch.T_gripper_object()[:3, 3] - closed[:3, 3]))
 
     def _move_to(self, q_goal: np.ndarray) -> None:
@@ -189,6 +192,7 @@ def plan_carry(kinematics: Kinematics, plan: GraspPlan, limits: MotionLimits) ->
     """Return the 30 mm sideways move that follows the lift: towards the middle if possible, else another direction."""
     start = plan.lift.q[-1]
     T = kinematics.pivot(start[:6])
+    # In the middle the sign is 0: either side will do
     inwards = -np.sign(T[1, 3]) or 1.0
     for direction in ((0.0, inwards), (0.0, -inwards), (-1.0, 0.0), (1.0, 0.0)):
         T_goal = T.copy()

@@ -101,6 +101,7 @@ def make_error_row(scenario: Scenario, method: str, error: Exception, *, top_k: 
     `sim_twin.benchmark.results.store.Store.add`) and no column of the table.
     """
     mode = Mode.ERROR.value
+    # Not `columns()`: sampling the neighbours may be what failed
     row: Row = {**scenario.identity(), "method": method, "version": _version()}
     row |= {"success": False, "success_top1": False, "top_k": top_k, "attempts": 1, "modes": [mode], "ranks": [-1]}
     row |= {"success_after": [False] * top_k, "given_up": "", "mode": mode}

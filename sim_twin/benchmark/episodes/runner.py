@@ -90,6 +90,7 @@ def run_tasks(tasks: Sequence[T], jobs: int, run: Callable[[T], list[Row]] = run
         set_environment(SINGLE_THREAD_ENV),
         ProcessPoolExecutor(jobs, mp_context=context, initializer=limit_threads) as pool,
     ):
+        # Two tasks a process: the next one is there when one ends
         yield from _iterate_completed(pool, tasks, 2 * jobs, run)
 
 
@@ -132,6 +133,7 @@ def make_grasp_selector(config: RuntimeConfig, scenario: Scenario, seed: int) ->
     from z1_runtime.perception.segmentation import Perception
     from z1_runtime.tasks.grasp_selection import GraspSelector
 
+    # The cache's key is the configuration: one set of models for all seeds
     base = _assembled(replace(config, seed=0))
     config, detector = select_target(replace(config, seed=seed), base.perception.detector, scenario)
     perception = base.perception

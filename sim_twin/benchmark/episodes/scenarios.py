@@ -81,6 +81,7 @@ class Scenario:
     @property
     def draw_seed(self) -> int:
         """Seed of this scenario alone, so that no two have the same noise."""
+        # Not `hash()`, which differs between processes
         return int.from_bytes(hashlib.sha256(self.key.encode()).digest()[:4], "big")
 
     @property

@@ -65,6 +65,7 @@ def _pairs(surface: Surface, config: SweepConfig) -> tuple[np.ndarray, np.ndarra
     points = np.repeat(contacts.points[chosen], config.n_directions, axis=0)
     normals = np.repeat(contacts.normals[chosen], config.n_directions, axis=0)
     tangents = rng.normal(size=points.shape) * np.tan(config.cone_rad) / 1.5
+    # The first direction of each place is the normal itself
     tangents[:: config.n_directions] = 0.0
     directions = _unit(tangents - normals)
     here = -np.sum(directions * normals, axis=1)
@@ -84,6 +85,7 @@ def _pairs(surface: Surface, config: SweepConfig) -> tuple[np.ndarray, np.ndarra
 
 def _deduplicate(middles: np.ndarray, directions: np.ndarray, scores: np.ndarray, config: SweepConfig) -> np.ndarray:
     """Return the indices of the best of each cell of middles (K, 3) and directions (K, 3), whose sign is arbitrary."""
+    # An oblique axis: with one along an edge, the sign of directions at right angles to it would be arbitrary
     upwards = directions * np.where(directions @ [0.31, 0.47, 0.83] < 0.0, -1.0, 1.0)[:, None]
     cells = np.column_stack([np.floor(middles / config.cell_m), np.round(upwards / config.cell_sine)]).astype(int)
     best_first = np.argsort(-scores, kind="stable")
@@ -95,6 +97,7 @@ def _approaches(closings: np.ndarray, config: SweepConfig) -> tuple[np.ndarray, 
     """Return which pair (M,) each of the approaches (M, 3) belongs to; one of them is as frontal as possible."""
     front = np.array([1.0, 0.0, 0.0]) - closings[:, :1] * closings
     above = np.array([0.0, 0.0, -1.0]) + closings[:, 2:] * closings
+    # Jaws that close nearly along x have no frontal approach: theirs starts from above
     start = _unit(np.where(np.linalg.norm(front, axis=1, keepdims=True) > 0.2, front, above))
     other = np.cross(closings, start)
     turn = np.arange(config.n_approaches) * 2.0 * np.pi / config.n_approaches

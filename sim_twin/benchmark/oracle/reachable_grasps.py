@@ -216,6 +216,7 @@ class GroundTruthScene:
 
 def _sample_evenly(surface: Surface) -> np.ndarray:
     """Return points (N, 3) about 2 mm apart all over `surface`, in its own frame [m]."""
+    # Four points a cell in the mean leave 2 % of the cells empty (Poisson)
     points = surface.sample(0.5 * _SPACING_M).points
     _, first = np.unique(np.floor(points / _SPACING_M).astype(int), axis=0, return_index=True)
     return points[np.sort(first)]

@@ -130,6 +130,7 @@ def _compare_methods(rows: Sequence[Row], others: Sequence[Row]) -> dict[str, An
 def _scene_key(row: Row) -> tuple[Any, ...]:
     """Return the columns that two episodes of one scene share; each seed samples its own clutter and physics."""
     sampled = row["seed"] if row["clutter"] or row["physics_noise"] else 0
+    # The oracle uses no image, so an occluded scene is the same one to it
     return *(row[column] for column in _SCENE_COLUMNS if column != "occlusion"), sampled
 
 

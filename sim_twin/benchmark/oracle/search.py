@@ -115,6 +115,7 @@ class _Search:
             plan = self._ground_truth.plan(choice)
             if isinstance(plan, Rejection):
                 self._rejected[plan.reason] += 1
+                # A rejected grasp counts as a failed one, which lowers the value of similar ones
                 find_grasps.add_failure(choice)
                 continue
             outcome = self._execute(plan)

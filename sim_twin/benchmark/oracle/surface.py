@@ -37,6 +37,7 @@ class _Hull:
     @classmethod
     def from_corners(cls, corners: np.ndarray) -> _Hull:
         hull = ConvexHull(corners)
+        # Qhull's facets are triangles: coplanar ones have the same equation up to rounding
         facets = np.unique(np.round(hull.equations, 9), axis=0)
         triangles = hull.points[hull.simplices]
         edges = triangles[:, 1:] - triangles[:, :1]
@@ -54,6 +55,7 @@ class _Hull:
         room = self.offsets - origins @ self.normals.T
         with np.errstate(divide="ignore", invalid="ignore"):
             at = room / rate
+        # A ray parallel to a facet never crosses it
         along = np.abs(rate) < 1e-12
         enters = np.where(along, np.where(room < 0.0, np.inf, -np.inf), np.where(rate < 0.0, at, -np.inf)).max(axis=1)
         leaving = np.where(~along & (rate > 0.0), at, np.inf)
@@ -77,6 +79,7 @@ class Surface:
         for own, hull in enumerate(self._hulls):
             count = int(np.ceil(hull.areas.sum() / spacing_m**2))
             which = rng.choice(len(hull.areas), count, p=hull.areas / hull.areas.sum())
+            # The square root spreads points evenly over a triangle (Osada et al. 2002)
             u, v = np.sqrt(rng.random(count)), rng.random(count)
             weights = np.column_stack([1.0 - u, u * (1.0 - v), u * v])
             p = np.einsum("nk,nkd->nd", weights, hull.triangles[which])

@@ -153,6 +153,7 @@ def plot_rate_curves(
         for x, successes, n in known:
             low, high = wilson(successes, n)
             axes.plot([x, x], [low, high], color=colour, alpha=0.5, linewidth=1)
+            # One artist a point, as a hint belongs to an artist
             (dot,) = axes.plot([x], [successes / n], "o", color=colour, markersize=4)
             canvas.add_hint(dot, f"{name}, {x:.3g}: {_describe(successes, n)}")
     axes.set(xlim=(-0.02, 1.02), ylim=(-0.02, 1.02), xlabel=x_label)
@@ -199,6 +200,7 @@ class _Canvas:
                 file, format="svg", transparent=True, metadata=dict.fromkeys(("Date", "Creator", "Format", "Type"))
             )
         svg = file.getvalue()
+        # HTML does not allow the XML declaration
         svg = svg[svg.index("<svg") :]
         for name, text in self._hints.items():
             svg = svg.replace(f'<g id="{name}">', f"<g><title>{escape(text)}</title>")

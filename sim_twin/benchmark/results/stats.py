@@ -60,6 +60,7 @@ def mcnemar(first: np.ndarray, second: np.ndarray) -> McNemar:
             code="unpaired",
         )
     b, c = int((first & ~second).sum()), int((~first & second).sum())
+    # Only discordant pairs carry information; without one there is no test
     return McNemar(b, c, float(binomtest(min(b, c), b + c).pvalue) if b + c else 1.0)
 
 

@@ -38,6 +38,7 @@ class Store:
                 f"store: {out} has the episodes of an earlier run. Add --resume to continue it, or give another --out."
             )
         self._folder.mkdir(parents=True, exist_ok=True)
+        # Left by a run that was killed
         for partial in self._folder.glob("*.partial"):
             partial.unlink()
 
@@ -59,6 +60,7 @@ class Store:
         path = self._folder / f"{rows[0]['scenario']}-{methods}.parquet"
         partial = path.with_suffix(".partial")
         pq.write_table(pa.Table.from_pylist(_align_columns(rows)), partial)
+        # On the disk before it has its name: a crash leaves no incomplete file under it
         with partial.open("rb") as file:
             os.fsync(file.fileno())
         partial.replace(path)
@@ -80,6 +82,7 @@ class Store:
         tables = [pq.read_table(path, columns=columns) for path in sorted(self._folder.glob("*.parquet"))]
         if not tables:
             return []
+        # Files of different methods lack different columns, or have only nulls in one
         rows = pa.concat_tables(tables, promote_options="permissive").to_pylist()
         return sorted(rows, key=lambda row: (row["scenario"], row["method"]))
 

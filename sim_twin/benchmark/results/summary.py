@@ -60,6 +60,7 @@ def write_summary(rows: Sequence[Row], path: Path, run: dict[str, Any]) -> dict[
     content = {"run": run, **summarise(rows)}
     partial = path.with_suffix(".partial")
     partial.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n")
+    # Replaced at once, so that no reader gets half of a file
     partial.replace(path)
     return content
 

@@ -103,6 +103,7 @@ def _fit_regularised(samples: Samples) -> ScoringHead:
 def _fit(samples: Samples, penalty: float) -> ScoringHead:
     from sklearn.linear_model import LogisticRegression
 
+    # Standardised: the L2 penalty would weigh features by their units
     mean, scale = samples.features.mean(axis=0), samples.features.std(axis=0)
     varies = np.flatnonzero(scale > _CONSTANT)
     model = LogisticRegression(C=penalty, max_iter=2000)
@@ -136,6 +137,7 @@ def _auc(success: np.ndarray, values: np.ndarray) -> float:
 def _loss(success: np.ndarray, probabilities: np.ndarray) -> float:
     from sklearn.metrics import log_loss
 
+    # A fold may have one outcome only, from which scikit-learn cannot infer the labels
     return float(log_loss(success, probabilities, labels=[False, True]))
 
 

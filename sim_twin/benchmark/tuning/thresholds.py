@@ -67,6 +67,7 @@ def _best_split(values: np.ndarray, success: np.ndarray) -> float | None:
     n, right = len(values), float(labels.sum())
     below = np.arange(1, n)
     right_below = np.cumsum(labels)[:-1]
+    # Equal values cannot be split
     allowed = (below >= MIN_GRASPS_PER_SIDE) & (n - below >= MIN_GRASPS_PER_SIDE) & (np.diff(values) > 1e-9)
     allowed &= right_below / below < (right - right_below) / np.maximum(n - below, 1)
     if not allowed.any():
@@ -77,5 +78,6 @@ def _best_split(values: np.ndarray, success: np.ndarray) -> float | None:
 
 
 def _log_likelihood(right: np.ndarray, n: np.ndarray) -> np.ndarray:
+    # A side without failures, or without successes, would have a logarithm of 0
     rate = np.clip(right / n, 1e-12, 1.0 - 1e-12)
     return right * np.log(rate) + (n - right) * np.log(1.0 - rate)

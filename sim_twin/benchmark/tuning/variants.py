@@ -54,6 +54,7 @@ def select_variant(
     outcomes = by_reading[reading]
     shared = sorted(set.intersection(*(set(outcomes[name]) for name in names)))
     poses = [scenario.rpartition("-s")[0] for scenario in shared]
+    # `max` returns the first of equals, here the hand-set one
     names = [baseline, *(name for name in names if name != baseline)]
 
     def best(scenarios: Sequence[str]) -> str:
