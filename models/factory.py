@@ -105,6 +105,7 @@ def make_generator(name: str, options: GeneratorOptions | None = None) -> GraspG
 def _find_weights_member(members: tuple[str, ...], options: GeneratorOptions) -> str | None:
     if options.weights is None:
         return None
+    # NVIDIA's generators first: they have no weights of their own, `diffusion` ships with some
     takers = [m for m in members if m in _TAKES_WEIGHTS] or [m for m in members if m == "diffusion"]
     if len(takers) != 1:
         takes = "takes no weights" if not takers else f"has {len(takers)} members that need weights of their own"

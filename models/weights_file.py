@@ -31,6 +31,7 @@ def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> str:
     """
     if path.suffix != ".npz":
         raise InvalidValueError(f"{path} must end in .npz: weights are kept as NumPy arrays.", code="weights_suffix")
+    # In the same folder, since a rename is atomic only within one file system
     partial = path.with_name(f".{path.stem}.{os.getpid()}.npz")
     try:
         np.savez(partial, allow_pickle=False, **arrays)

@@ -88,6 +88,7 @@ class YoloModel:
         blob = letterbox.blob(image)
         rows, prototypes = self._network.run(blob)
         if self.config.mirrored and rows.shape[1] == count_anchors(self._network.input_hw):
+            # A copy, as torch takes no array with negative strides
             mirrored, _ = self._network.run(np.ascontiguousarray(blob[..., ::-1]))
             rows = average_mirrored(rows, mirrored, len(self.classes), self._network.input_hw)
         return read_outputs(

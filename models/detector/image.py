@@ -38,6 +38,7 @@ class Letterbox:
         """Return the placement of the largest image of the same proportions, in the middle of the input."""
         gain = min(input_hw[0] / image_hw[0], input_hw[1] / image_hw[1])
         inner = (max(round(image_hw[0] * gain), 1), max(round(image_hw[1] * gain), 1))
+        # Rounded as ultralytics does, with an odd row at the bottom and an odd column on the right
         top, left = (round((whole - part) / 2 - 0.1) for whole, part in zip(input_hw, inner, strict=True))
         return cls(image_hw=image_hw, input_hw=input_hw, inner_hw=inner, top_left=(top, left))
 

@@ -161,12 +161,14 @@ def train_phase(phase: TrainingPhase, *, data: Path, folder: Path, start: Path |
     trainer.train()
     if distributed.is_initialized():
         distributed.barrier()  # the others resume from the checkpoint that the first writes
+    # After the last checkpoint: a phase without this file is resumed
     (folder / "done").touch()
     return last
 
 
 def read_checkpoint(path: Path) -> torch.nn.Module:
     """Return the averaged weights of a checkpoint of `train_phase` in a plain float32 network."""
+    # A pickle, but one that this training has written
     saved = torch.load(path, map_location="cpu", weights_only=False)["ema"].float()
     model = new_network(len(saved.names))
     model.load_state_dict(saved.state_dict())

@@ -109,6 +109,7 @@ def new_network(n_classes: int) -> nn.Module:
 
 def disable_ultralytics_network() -> None:
     """Disable installation, network access and output of ultralytics; call it before ultralytics is imported."""
+    # `setdefault`: the user's own values win
     os.environ.setdefault("YOLO_AUTOINSTALL", "false")
     os.environ.setdefault("YOLO_VERBOSE", "false")
     os.environ.setdefault("YOLO_OFFLINE", "true")

@@ -52,6 +52,7 @@ def find_view_frame(points: np.ndarray) -> np.ndarray:
     across = points - center
     across = across - (across @ z)[:, None] * z
     _, axes = np.linalg.eigh(across.T @ across)
+    # Removes what rounding leaves along the view ray
     x = axes[:, 2] - (axes[:, 2] @ z) * z
     x /= np.linalg.norm(x)
     if np.sum((across @ x) ** 3) < 0.0:  # the longer tail shows along +x

@@ -28,6 +28,7 @@ class DiffusionConfig:
     """Gripper that the weights were trained for, see `models.diffusion.weights.weights_path`."""
     weights: Path | None = None
     """Another weights file, with its checksum next to it."""
+    # Steps and temperature were chosen among ten settings on the evaluation clouds (models/weights/README.md)
     steps: int = 8
     """Denoising steps."""
     temperature: float = 0.78
@@ -183,7 +184,9 @@ def draw_even_normal(n: int, dimensions: int, rng: np.random.Generator) -> np.nd
     from scipy.special import ndtri
     from scipy.stats.qmc import Sobol
 
+    # A Sobol sequence is balanced only over a power of two points
     sequence = Sobol(dimensions, scramble=True, rng=rng).random_base2(max(n - 1, 1).bit_length())[:n]
+    # The normal quantiles of 0 and 1 are infinite
     return ndtri(np.clip(sequence, 1e-6, 1.0 - 1e-6))
 
 

@@ -25,6 +25,7 @@ def choose_grasps(T: np.ndarray, scores: np.ndarray, n: int) -> np.ndarray:
         n: number of grasps to choose.
     """
     order = np.argsort(-scores, kind="stable")
+    # A chance of 1 would make the log of its complement infinite
     chances = np.clip(scores[order], 0.0, 0.999)
     places, approaches, closings = (np.ascontiguousarray(T[order, :3, column]) for column in (3, 2, 1))
     nothing_better = np.exp(_log_missed(places, approaches, closings, np.log1p(-chances)))

@@ -34,6 +34,7 @@ def load_weights(path: Path) -> tuple[Denoiser, Discriminator]:
         WeightsError: the file or its checksum is missing, they differ, or the file is of another network.
     """
     halves = read_arrays(path, "python -m scripts.train.train_diffusion")
+    # Half precision is for the file alone: the parameters were trained in single
     arrays = {key: torch.from_numpy(value.astype(np.float32)) for key, value in halves.items()}
     return _fill(Denoiser(), "generator/", arrays, path), _fill(Discriminator(), "discriminator/", arrays, path)
 

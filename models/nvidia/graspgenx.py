@@ -48,6 +48,7 @@ def _make_sweep_box(jaw_rad: float) -> tuple[list[float], list[float]]:
 
 
 def _describe_z1() -> dict[str, Any]:
+    # The opening at which the knees are that far apart, a chord of the circle about the axis
     jaw_rad = 2.0 * math.asin(_WIDEST_M / 2.0 / KNEE_RADIUS_M)
     (extents, offset), (half_extents, half_offset) = _make_sweep_box(jaw_rad), _make_sweep_box(jaw_rad / 2.0)
     tips = offset[2] + extents[2] / 2.0

@@ -55,6 +55,7 @@ class ProcessGenerator:
         Raises:
             GeneratorError: the process does not start, or its package or checkpoint cannot be used.
         """
+        # -I: no path of the user may shadow the packages of that environment
         self._name, self._command = name, [str(python), "-I", str(worker), name, str(checkpoint)]
         self._start_timeout_s, self._timeout_s = start_timeout_s, timeout_s
         self._lock = threading.Lock()

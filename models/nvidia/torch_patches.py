@@ -27,6 +27,7 @@ def cuda_if_available() -> Iterator[None]:
     if torch.cuda.is_available():
         yield
         return
+    # The patch is global: a second thread would keep the patched method as the original
     with _PATCHING:
         owners: tuple[Any, ...] = (Tensor, nn.Module)
         kept = [owner.cuda for owner in owners]
@@ -50,6 +51,7 @@ def seed_random_numbers(seed: int) -> Iterator[None]:
     try:
         with torch.random.fork_rng():
             torch.manual_seed(seed)
+            # NumPy's legacy generator takes 32 bits
             np.random.seed(seed % 2**32)
             yield
     finally:
@@ -81,8 +83,10 @@ class _FoldedAttention(nn.Module):
         weight, bias = attention.in_proj_weight, attention.in_proj_bias
         out = attention.out_proj
         with torch.no_grad():
+            # In double precision, so that folding adds no rounding of its own
             W_out = out.weight.double()
             self.linear = nn.Linear(dim, dim, device=out.weight.device, dtype=out.weight.dtype)
+            # The projection holds queries, keys and values, in this order
             self.linear.weight.copy_(W_out @ weight[2 * dim :].double())
             self.linear.bias.copy_(W_out @ bias[2 * dim :].double() + out.bias.double())
 

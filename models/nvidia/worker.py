@@ -13,6 +13,7 @@ import sys
 from pathlib import Path
 
 _ROOT = Path(__file__).resolve().parents[2]
+# The project's own minimum, since its modules are imported here
 _OLDEST = (3, 11)
 
 

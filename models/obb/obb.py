@@ -36,6 +36,7 @@ class OrientedBox:
         shapes = (self.T_camera_box.shape, self.half_extents_m.shape, self.unobserved.shape)
         if shapes != ((4, 4), (3,), (3,)):
             raise InvalidValueError(f"OrientedBox takes (4, 4), (3,), (3,); got {shapes}.", code="shape")
+        # `frozen` does not protect the content of arrays, which several stages share
         for array in (self.T_camera_box, self.half_extents_m, self.unobserved):
             array.setflags(write=False)
 

@@ -175,6 +175,7 @@ def _find_antipodal_pairs(surfels: Surfels, config: AntipodalConfig) -> tuple[np
     points, normals = surfels.points, surfels.normals
     # |p_j − p_i|² and the two n·(p_j − p_i) of all pairs come from three matrix products.
     squared = np.sum(points**2, axis=1)
+    # Rounding leaves the diagonal just below 0, which has no root
     distance = np.sqrt(np.maximum(squared[:, None] + squared - 2.0 * points @ points.T, 1e-12))
     own = np.sum(normals * points, axis=1)
     along = (normals @ points.T - own[:, None]) / distance  # cos between n_i and the line from i to j

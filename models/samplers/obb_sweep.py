@@ -184,6 +184,7 @@ class ObbSweepSampler:
         config = self.config
         along, deep, across = (cloud @ axis for axis in (sweep.along, sweep.approach, sweep.closing))
         between = np.abs(along - places[:, None]) < config.slice_m
+        # Points deeper than the fingertips reach are not between the jaws
         between &= deep < config.max_depth_m - sweep.half_depth_m
         measured = between.sum(axis=1) >= _MIN_SLICE_POINTS
         lowest = np.where(between, across, np.inf).min(axis=1)

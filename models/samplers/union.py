@@ -45,6 +45,7 @@ class UnionSampler:
                 f"union: {len(members)} generator given, allowed is two or more.", code="union_members"
             )
         if scorer is None:
+            # Imported here: it loads torch, which a given scorer may not need
             from models.diffusion.scorer import GraspScorer
 
             scorer = GraspScorer()
@@ -65,6 +66,7 @@ class UnionSampler:
         T = np.concatenate([grasps.T_camera_grasps for grasps in found])
         widths = np.concatenate([grasps.widths_m for grasps in found])
         source = "union:" + "+".join(grasps.source for grasps in found)
+        # The members' own scores are not comparable, so all are scored by one discriminator
         proposed = GraspSet(T_camera_grasps=T, scores=np.zeros(len(T)), widths_m=widths, source=source)
         scores = self._scorer.score(points, proposed, seed)
         order = np.argsort(-scores, kind="stable")
@@ -93,10 +95,12 @@ def find_duplicates(T: np.ndarray) -> np.ndarray:
     near = np.sort(near, axis=1)
     first, second = near[:, 0], near[:, 1]
     approach = np.sum(T[first, :3, 2] * T[second, :3, 2], axis=1)
+    # A parallel gripper is the same with its fingers exchanged
     closing = np.abs(np.sum(T[first, :3, 1] * T[second, :3, 1], axis=1))
     same = (approach > np.cos(_SAME_DIRECTION_RAD)) & (closing > np.cos(_SAME_DIRECTION_RAD))
     duplicates = np.zeros(len(T), dtype=bool)
     pairs = near[same]
+    # Best first: a grasp that is dropped itself drops no other
     for better, worse in pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]:
         if not duplicates[better]:
             duplicates[worse] = True

@@ -96,6 +96,7 @@ class BoardSearch:
             MotionError, HalError: no collision-free motion, or the arm does not follow.
         """
         frame, q = self.capture_still_frame()
+        # Obstacles are scanned from home; until then the table is all that is known
         if not self.move_to(self._home(), make_table_checker(self.kinematics, frame, q)):
             raise MotionError(
                 "board search: no collision-free motion home from here. Move the arm up by hand, then try again."
@@ -105,6 +106,7 @@ class BoardSearch:
         try:
             T_base_board = self._board_in_base(frame, q)
         except CalibrationError as error:
+            # Another view would show the same board
             if error.code == "wrong_board":
                 raise
             above = self.kinematics.best(_FROM_ABOVE @ inverse(self._T_flange_camera) @ z1.T_FLANGE_PIVOT)
@@ -169,6 +171,7 @@ class BoardSearch:
         return np.append(z1.Q_HOME, self.views.jaw)
 
     def _q_command(self) -> np.ndarray:
+        # A command that the servo took from a measured state may be a hair beyond a limit
         return np.clip(self._arm.status().q_command, z1.Q_MIN, z1.Q_MAX)
 
     def _board_in_base(self, frame: RgbdFrame, q: np.ndarray) -> np.ndarray:
@@ -190,6 +193,7 @@ def capture_still_frame(arm: Arm, camera: Camera, timeout_s: float) -> tuple[Rgb
         frame = camera.wait_for_frame(timeout_s)
         after = arm.read_state().q
         if is_still(before, after):
+            # The exposure is between the two readings
             return frame, (before + after) / 2
         before, moved = after, np.abs(after - before)
     joint = int(moved[: z1.N_ARM].argmax())

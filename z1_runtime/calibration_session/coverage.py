@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from z1_runtime.calibration_session.capture import CapturedView
 
+# Square cells: the D405's 640 × 480 pixels in tiles of 80
 _ROWS, _COLUMNS = 6, 8
 _SHADES = " ░▒▓█"
 
@@ -32,7 +33,9 @@ class Coverage:
         for sample in valid:
             assert sample.view is not None
             width, height = sample.view.image_size
+            # Whole numbers are the centres of pixels in OpenCV, so the image begins at −0.5
             column, row = (sample.view.pixels_px.T + 0.5) * [[_COLUMNS / width], [_ROWS / height]]
+            # `+=` would count a cell once, however many corners share it
             np.add.at(corners, (row.astype(int).clip(0, _ROWS - 1), column.astype(int).clip(0, _COLUMNS - 1)), 1)
         return cls(
             corners=corners,
@@ -58,6 +61,7 @@ def _rotation_spread_deg(rotations: Sequence[np.ndarray]) -> np.ndarray:
         return np.zeros(3)
     orientations = Rotation.from_matrix(np.array(rotations))
     rotations_rad = (orientations.mean().inv() * orientations).as_rotvec()
+    # Rounding can leave an eigenvalue just below 0, which has no root
     return 2.0 * np.rad2deg(
         np.sqrt(np.maximum(np.linalg.eigvalsh(rotations_rad.T @ rotations_rad / len(rotations_rad))[::-1], 0.0))
     )

@@ -100,6 +100,7 @@ class TipCheck:
         """
         for corner in _sample_farthest(self._board.corners_m, self._config.n):
             p_base_corner = transform_points(T_base_board, self._board.corners_m[corner])
+            # The board's z points into it
             target = p_base_corner - self._config.height_m * T_base_board[:3, 2]
             motions = self._plan(target, -T_base_board[:3, 2], checker)
             if motions is None:
@@ -118,6 +119,7 @@ class TipCheck:
         self, target: np.ndarray, up: np.ndarray, checker: CollisionChecker
     ) -> tuple[JointTrajectory, JointTrajectory, JointTrajectory] | None:
         """Return transfer, descent and ascent at `target` (3,), with the gripper as upright as possible."""
+        # A command that the servo took from a measured state may be a hair beyond a limit
         q_from = np.clip(self._arm.status().q_command, z1.Q_MIN, z1.Q_MAX)
         for T_base_tip in _tip_poses(target, up):
             T_low = T_base_tip @ inverse(T_PIVOT_TIP)
@@ -130,6 +132,7 @@ class TipCheck:
                     ascent = straight_move(self._kinematics, T_low, T_high, descent.q[-1], limits=self._limits)
                 except PathFailure:
                     continue
+                # The arm alone: the tip must come closer to the table than the gripper's margin allows
                 if checker.check_posture(descent.q[-1]) is not None:
                     continue
                 transfer = plan_free_motion(checker, q_from, q_high, self._limits)
@@ -151,6 +154,7 @@ def _tip_poses(p_base_tip: np.ndarray, up: np.ndarray) -> Iterator[np.ndarray]:
     across /= np.linalg.norm(across)
     upright = np.column_stack([-up, across, np.cross(-up, across)])
     for tilt in _TILTS_RAD:
+        # Without a tilt its axis does not matter
         for azimuth in _YAWS_RAD if tilt else (0.0,):
             axis = Rotation.from_rotvec(azimuth * up).apply(across)
             for yaw in _YAWS_RAD:

@@ -127,6 +127,7 @@ def _checker(  # noqa: PLR0917 - robot, frame, pose of the camera, then what fol
         detection=Detection(label="board", confidence=1.0, box_px=(0, 0, 0, 0)),
         object_points=np.empty((0, 3)),
         scene_points=obstacles,
+        # z = 0 of the base: converted back by the same extrinsics, so their error cancels
         table=expected_table(T_base_camera),
     )
     return CollisionChecker(kinematics, PlanningScene.from_observation(observation, q, kinematics, config))
@@ -179,6 +180,7 @@ def find_viewpoints(
         if not branches:
             rejected["out of reach"] += 1
             continue
+        # The branch nearest to home, the paper's choice
         q = np.append(min(branches, key=lambda q: float(np.sum((q - z1.Q_HOME) ** 2))), config.jaw)
         if checker.check_posture(q) is not None or not _is_clear(checker, kinematics, q):
             rejected["collision"] += 1
@@ -252,6 +254,7 @@ def _select_spread(views: Sequence[Viewpoint], n: int, existing: Sequence[np.nda
     first = int(np.argmax([view.visible_ratio for view in views]))
     chosen: list[int] = []
     while len(chosen) < n:
+        # Without an earlier view all distances are infinite
         chosen.append(int(nearest.argmax()) if np.isfinite(nearest).all() else first)
         nearest = np.minimum(nearest, _distances(Ts, Ts[chosen[-1]]))
     return [views[index] for index in chosen]

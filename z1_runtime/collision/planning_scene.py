@@ -99,6 +99,7 @@ def _extend_to_table(points: np.ndarray, table: Plane, cut_off_m: float) -> np.n
     if not len(points):
         return points
     height = table.height_m(points)
+    # A percentile, not the minimum: one speckle near the table would count as the object's foot
     lowest = float(np.percentile(height, 1.0))
     if not lowest >= cut_off_m:  # NaN is left to the index, which rejects it
         return points

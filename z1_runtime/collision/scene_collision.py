@@ -154,6 +154,7 @@ class CollisionChecker:
 
     def _lowest(self, T: np.ndarray, vertices: np.ndarray) -> np.ndarray:
         up = self.scene.table.normal
+        # Heights alone are needed: one product for each vertex and pose instead of three
         return (up @ T[:, :3, :3] @ vertices.T).min(axis=1) + T[:, :3, 3] @ up - self.scene.table.offset_m
 
     def _hits(self, index: SceneIndex, parts: tuple, threshold_m: float, active: np.ndarray) -> np.ndarray:
@@ -193,7 +194,9 @@ def _format_point(point: np.ndarray) -> str:
 
 def _capsule_surface(start: np.ndarray, end: np.ndarray, radius_m: float) -> np.ndarray:
     """Return points about 12 mm apart on a capsule's round side."""
+    # The bound keeps a capsule of no length, a sphere, finite
     axis = (end - start) / max(float(np.linalg.norm(end - start)), 1e-9)
+    # The coordinate axis least parallel to the capsule: the product cannot vanish
     across = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
     across /= np.linalg.norm(across)
     along = np.linspace(0.0, 1.0, int(np.linalg.norm(end - start) / _SURFACE_SPACING_M) + 2)[:, None, None]

@@ -70,6 +70,7 @@ def check_arm(poses: ArmPoses, table: Plane, link_margin_m: float, stage: Planni
     if one >= 0:
         detail = f"{CAPSULES[one].link} would hit {CAPSULES[other].link}."
         return Rejection(reason=RejectionReason.SELF, stage=stage, detail=detail)
+    # Contiguous, the layout that `warm_up` has compiled
     obstacles = np.ascontiguousarray(ends[:, _OBSTACLES])
     shape = gripper_shape()
     parts = (("gripper or camera", poses.pivots, shape.fixed), ("the moving jaw", poses.jaws, shape.moving_jaw))
@@ -83,6 +84,7 @@ def check_arm(poses: ArmPoses, table: Plane, link_margin_m: float, stage: Planni
 
 def warm_up() -> None:
     """Load compiled kernels, so that the first check is as fast as the next."""
+    # Read-only arrays, as the gripper's are, are a type of their own to Numba
     pose, read_only = np.eye(4)[None], gripper_shape().fixed[:1]
     ends = np.array([[[(0.0, 0.0, 0.0), (1.0, 0.0, 0.0)]]])
     _first_capsule_hit(pose, read_only, ends, np.zeros(1))

@@ -40,6 +40,7 @@ class SceneIndex:
             )
         self.max_threshold_m = max_threshold_m
         if len(self.points):
+            # A block more than the threshold, so that all cells within reach of a point are inside the grid
             margin = max_threshold_m + _BLOCK_M
             self._origin = self.points.min(axis=0) - margin
             self._shape = ((self.points.max(axis=0) + margin - self._origin) / _BLOCK_M).astype(np.int64) + 1

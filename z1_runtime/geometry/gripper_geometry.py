@@ -76,6 +76,7 @@ def fit_jaws(widths: np.ndarray, fronts: np.ndarray, config: GripperPlacementCon
     r = 0.5 * widths
     knees = np.sqrt(np.maximum(KNEE_RADIUS_M**2 - r**2, 0.0)) - np.minimum(config.knee_past_m, _MAX_PAST_RATIO * r)
     palm_m = PALM_RADIUS_M + config.palm_clearance_m
+    # Objects wider than 65 mm touch the palm before the knees
     distance = np.maximum(knees, palm_m + np.minimum(fronts, r))
     above, contact = _gap(distance, r)
     centre = _polar(distance, above)
@@ -86,6 +87,7 @@ def fit_jaws(widths: np.ndarray, fronts: np.ndarray, config: GripperPlacementCon
     along = np.column_stack([across[:, 1], -across[:, 0]])
     push = np.sum((2.0 * centre - on_stationary - on_moving) * along, axis=1)
     above_open, opened = _gap(distance, r + config.clearance_m)
+    # Half of the squeeze on each jaw; thinner objects end with the jaws closed
     above_pressed, pressed = _gap(distance, np.maximum(r - 0.5 * config.squeeze_m, 0.0))
     return JawFit(
         contact=contact,
@@ -116,6 +118,7 @@ def _bearing(face, distance, r, side):
     bearings = np.empty(len(r))
     for n in range(len(r)):
         low, high = 0.0, 0.5 * np.pi
+        # 22 halvings of 90° leave 4e-7 rad, or 0.03 µm at the knees
         for _ in range(22):
             middle = 0.5 * (low + high)
             angle = on_face + side * middle

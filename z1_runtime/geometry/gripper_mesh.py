@@ -45,6 +45,7 @@ def gripper_shape(spacing_m: float = _SPACING_M) -> GripperShape:
     fixed = np.concatenate([stator[~inside], wrist, camera, bracket])
     moving_jaw = _mesh_surface("z1_GripperMover", _JAW_SPACING_M)
     shape = GripperShape(fixed=spread_first(fixed), moving_jaw=spread_first(moving_jaw))
+    # The cache gives the same arrays to every caller
     shape.fixed.setflags(write=False)
     shape.moving_jaw.setflags(write=False)
     return shape
@@ -52,6 +53,7 @@ def gripper_shape(spacing_m: float = _SPACING_M) -> GripperShape:
 
 def spread_first(vertices: np.ndarray) -> np.ndarray:
     """Return `vertices` (V, 3) reordered so that any head of the list is spread over the whole: hits come early."""
+    # Seeded: which point is hit first is part of a rejection's text
     order = np.random.default_rng(0).permutation(len(vertices))
     return vertices[order]
 
@@ -61,6 +63,7 @@ def _mesh_surface(name: str, spacing_m: float) -> np.ndarray:
     import trimesh
 
     mesh = trimesh.load_mesh(z1.mesh_dir() / "collision" / f"{name}.STL")
+    # 40 samples for each face of a voxel leave hardly any voxel of the surface empty
     n_dense = int(40.0 * mesh.area / spacing_m**2)
     dense = np.asarray(trimesh.sample.sample_surface(mesh, n_dense, seed=0)[0])
     return _thinned(dense, spacing_m)

@@ -170,6 +170,7 @@ class Kinematics(ForwardKinematics):
         for seed in (q_near, *_SEEDS):
             q = self._least_squares(T_base_pivot, seed, q_near)
             position_error_m, rotation_error_rad = pose_error(self.pivot(q), T_base_pivot)
+            # At most 1 within the paper's 2 mm and 1°
             misfit = max(position_error_m / POSITION_TOLERANCE_M, rotation_error_rad / ROTATION_TOLERANCE_RAD)
             tries.append((misfit, q, position_error_m, rotation_error_rad))
             if misfit <= 1.0:
@@ -199,6 +200,7 @@ class Kinematics(ForwardKinematics):
         cost = _cost(residual, q, q_near)
         damping = 1e-2
         for _ in range(_MAX_ITERATIONS):
+            # In units of the tolerances, so that 2 mm weigh as much as 1°
             J = self.jacobian(q) / _TOLERANCES[:, None]
             H = J.T @ J + _REGULARISATION * np.eye(z1.N_ARM)
             downhill = J.T @ residual - _REGULARISATION * (q - q_near)
@@ -209,6 +211,7 @@ class Kinematics(ForwardKinematics):
             while damping < _MAX_DAMPING:
                 H_free = H[np.ix_(free, free)]
                 step = np.zeros(z1.N_ARM)
+                # Marquardt's damping, in proportion to each joint's own curvature
                 step[free] = np.linalg.solve(H_free + damping * np.diag(H_free.diagonal()), downhill[free])
                 q_new = np.clip(q + step, _ARM_MIN, _ARM_MAX)
                 residual_new = self._residual(q_new, T_base_pivot)

@@ -74,6 +74,7 @@ class BeakGripper:
 
     def __init__(self, config: GripperPlacementConfig | None = None) -> None:
         self.config = config or GripperPlacementConfig()
+        # Half angle of the friction cone
         self._max_squeeze_out = float(np.arctan(self.config.friction))
         fits = self._is_feasible(fit_jaws(_WIDTHS_M, 0.5 * _WIDTHS_M, self.config))
         self.max_width_m = float(_WIDTHS_M[fits].max(initial=0.0))
@@ -132,6 +133,7 @@ class BeakGripper:
         jaw_fit = fit_jaws(widths, fronts, self.config)
         T_grasp_pivot = _grasp_to_pivot(jaw_fit.centre, jaw_fit.tilt)
         T_grasp_pivot[:, 2, 3] -= self.config.contact_depth_m + jaw_fit.setback_m
+        # The same grasp to a parallel gripper; here stationary and moving jaw change sides
         flip = np.diag([-1.0, -1.0, 1.0, 1.0])
         T_base_pivots = np.stack([T_base_grasps @ T_grasp_pivot, T_base_grasps @ flip @ T_grasp_pivot], axis=1)
         return GripperFits(
@@ -147,6 +149,7 @@ class BeakGripper:
 
     def _is_feasible(self, jaw_fit: JawFit) -> np.ndarray:
         held = (jaw_fit.squeeze_out <= self._max_squeeze_out) & (jaw_fit.setback_m <= self.config.max_setback_m)
+        # Openings are positive, jaw angles negative
         return held & (jaw_fit.opened <= -z1.GRIPPER_OPEN)
 
 

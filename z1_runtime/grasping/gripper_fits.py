@@ -44,6 +44,7 @@ class LazyFits:
         """(N,) 1 where the jaws' push is level, 0 where friction just holds, once fitted."""
         self._checker = checker
         self._fallback_width_m = fallback_width_m
+        # Also without a grasp, as indices are divided by it
         self._chunk = max(1, chunk)
         points = checker.scene.object_points
         self._shape_points = points[:: max(1, len(points) // _MAX_SHAPE_POINTS)]
@@ -83,6 +84,7 @@ class LazyFits:
         moved = np.abs(offset) > _REFIT_THRESHOLD_M
         if moved.any():
             there, widths[moved], _ = self._centre(_advance(Ts[moved], offset[moved]), given[moved])
+            # Back to the requested depth: the offsets of all grasps are applied below
             T_base_grasps[moved] = _advance(there, -offset[moved])
         self.widths_m[part], self.fronts_m[part] = widths, fronts + deeper
         self.support[part] = measure_support(
@@ -110,7 +112,9 @@ class LazyFits:
         """
         fits = self.gripper.fit_batch(Ts, widths_m, fronts_m)
         spare = self._checker.spare_height_m(fits.T_base_pivots.reshape(-1, 4, 4), np.repeat(fits.jaw_open, 2))
+        # A level approach never meets the table: its clearance is large, but finite
         down = np.maximum(-Ts[:, :3, 2] @ self._checker.scene.table.normal, 1e-3)
+        # Of the better flip, since either may be taken
         clearance_m = spare.reshape(-1, 2).max(axis=1) / down
         max_m = np.minimum(self.gripper.config.max_deepening_m, np.maximum(clearance_m, 0.0))
         return np.clip(0.5 * widths_m - fronts_m, 0.0, max_m), fits.setback_m

@@ -78,6 +78,7 @@ class Executor:
         moved_s = self._clock.now_s()
         while True:
             status = self._poll()
+            # Until the servo has the first chunk, its status is that of the motion before
             ours = status.trajectory_id == trajectory_id
             if ours and status.finished:
                 return
@@ -91,10 +92,12 @@ class Executor:
                 played_s, moved_s = status.trajectory_time_s, self._clock.now_s()
             elif self._clock.now_s() - moved_s > self._config.stall_timeout_s:
                 raise MotionError(_describe_stall(status, trajectory_id, played_s), code="stalled")
+            # No more than the lead: the arm plays what it has, also after the runtime's end
             while chunks and sent_s - played_s < self._config.lead_s:
                 chunk = chunks.popleft()
                 self._arm.stream(chunk)
                 sent_s = float(chunk.t_s[-1])
+            # In lock-step, time moves only while a caller sleeps
             self._clock.sleep_until(self._clock.now_s() + self._config.poll_s)
 
     def settle(self) -> ArmState:

@@ -56,6 +56,7 @@ class MotionLimits:
         ceilings = {"velocity": z1.DQ_MAX, "acceleration": z1.DDQ_MAX, "jerk": z1.DDDQ_MAX}
         for name, ceiling in ceilings.items():
             limit = np.array(getattr(self, name), dtype=np.float64)
+            # The factor admits the rounding of a scaled limit
             if limit.shape != (z1.N_JOINTS,) or not ((limit > 0.0) & (limit <= ceiling * (1 + 1e-9))).all():
                 raise InvalidValueError(f"{name} is {limit}; allowed is (7,), above 0 and up to {ceiling}.")
             limit.setflags(write=False)

@@ -60,6 +60,7 @@ def find_extrinsics(serial: str, file: Path | None = None, folder: Path | None =
         found = load_result(file, serial=serial) if file is not None else load_newest(folder, "hand_eye", serial)
         T_flange_camera = found.T_flange_camera
     except CalibrationError as error:
+        # Only an absent result falls back to the drawing: a damaged one must not pass unnoticed
         if file is None and error.code == "missing_result":
             return _nominal(serial, folder)
         raise ConfigError(str(error), code=error.code) from error

@@ -93,6 +93,7 @@ class ExtrinsicsCheck:
             return None
         surface, normals = _jaw_surface(jaw)
         lens = T_flange_camera[:3, 3]
+        # Only faces turned to the lens can be in its picture
         facing = np.einsum("ij,ij->i", surface - lens, normals) < 0.0
         surface, normals = surface[facing], normals[facing]
         tree, T = cKDTree(surface), T_flange_camera.copy()
@@ -148,6 +149,7 @@ def _point_to_plane_step(at: np.ndarray, normals: np.ndarray, residuals: np.ndar
     weights = 1.0 / (1.0 + (residuals / _CAUCHY_M) ** 2)
     jacobian = np.column_stack([normals, np.cross(at, normals)])
     weighted = jacobian * weights[:, None]
+    # The diagonal keeps directions finite that the matched faces leave free
     x = np.linalg.solve(weighted.T @ jacobian + 1e-6 * np.eye(6), -weighted.T @ residuals)
     step = np.eye(4)
     step[:3, :3], step[:3, 3] = Rotation.from_rotvec(x[3:]).as_matrix(), x[:3]

@@ -83,4 +83,5 @@ def _grow(mask: np.ndarray, by_px: int) -> np.ndarray:
     kernel = np.ones((2 * abs(by_px) + 1,) * 2, np.uint8)
     if by_px >= 0:
         return cv2.dilate(mask.astype(np.uint8), kernel).astype(bool)
+    # Outside counts as mask: the image's border is no edge of the object
     return cv2.erode(mask.astype(np.uint8), kernel, borderType=cv2.BORDER_CONSTANT, borderValue=1).astype(bool)

@@ -86,6 +86,7 @@ class Perception:
         estimate = config.extrinsics_check.correct(frame, gripper, jaw, T_flange_camera)
         if estimate is not None:
             T_flange_camera = estimate.T_flange_camera
+            # Once: each frame would repeat it
             if not self._correction_logged:
                 self._correction_logged = True
                 _LOG.warning(
@@ -144,6 +145,7 @@ class Perception:
             crop = box_pixels(depth.shape, detection.box_px)
         rim = cv2.dilate(crop.astype(np.uint8), np.ones((2 * config.rim_px + 1,) * 2, np.uint8)).astype(bool)
         continuous = continuous_pixels(depth)
+        # Flying pixels stay inside the crop: the paper takes the depth percentiles of all of it
         used = valid_pixels(depth, config.d_max_m) & (continuous | crop)
         points = back_project(depth, frame.intrinsics, used)
         table = fit_table(points, expected_table(T_base_camera), config.table)
@@ -168,6 +170,7 @@ class Perception:
         """Return the object among the points of a crop, given those above the table and those of continuous depth."""
         config = self._config
         counts = {"crop": len(points)}
+        # As in the paper, before the table is removed
         keep = depth_clip(points, *config.clip_percent)
         counts["depth clip"] = int(keep.sum())
         keep &= above

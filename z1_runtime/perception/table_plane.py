@@ -73,6 +73,7 @@ def fit_table(
             "the cloud has points behind the camera (z <= 0); give it in the camera frame.", code="behind_camera"
         )
     if hint is not None:
+        # Bounds the time of the height test
         points = _thin(points, 3 * config.n_points)
         points = points[np.abs(hint.height_m(points)) < config.max_height_m]
     points = _thin(points, config.n_points)
@@ -115,6 +116,7 @@ def _ransac(points: np.ndarray, hint: Plane | None, config: TableConfig, seed: i
     triples = points[rng.integers(len(points), size=(config.n_hypotheses, 3))]
     normals = np.cross(triples[:, 1] - triples[:, 0], triples[:, 2] - triples[:, 0])
     length = np.linalg.norm(normals, axis=1)
+    # Three points on a line span no plane
     good = length > 1e-8
     triples, normals = triples[good], normals[good] / length[good, None]
     offsets = np.einsum("ij,ij->i", normals, triples[:, 0])
@@ -126,6 +128,7 @@ def _ransac(points: np.ndarray, hint: Plane | None, config: TableConfig, seed: i
         normals, offsets = normals[near], offsets[near]
     if not len(normals):
         return None
+    # Bounds the residuals, one for each point and hypothesis
     sample = _thin(points, 2000)
     residual = sample @ normals.T - offsets
     best = int(np.argmin(np.minimum(residual**2, config.inlier_m**2).sum(axis=0)))

@@ -70,6 +70,7 @@ class PickMotionPlanner:
         """
         furthest: Rejection | None = None
         for placement in placements:
+            # Equal stand-offs are tried once
             for standoff_m in dict.fromkeys((self._config.standoff_m, self._config.short_standoff_m)):
                 T_pre = _shift(placement.T_base_pivot, -standoff_m * placement.T_base_grasp[:3, 2])
                 with self._timer("ik"):
@@ -83,6 +84,7 @@ class PickMotionPlanner:
                     if isinstance(motion, PickMotion):
                         return motion
                     furthest = _further(furthest, motion)
+                # The short stand-off is for poses out of reach, not for collisions
                 break
         return furthest or _reject_ik("there is no placement of the gripper.")
 
@@ -99,6 +101,7 @@ class PickMotionPlanner:
             except IkFailure as failure:
                 return _reject_ik(f"{failure} (least squares)")
             T_base_pivot = self._kinematics.pivot(result.q)
+            # The gripper's turn while it closes is relative to the pivot, and moves with it
             turn = inverse(placement.T_base_pivot) @ placement.T_base_touch
             return replace(placement, T_base_pivot=T_base_pivot, T_base_touch=T_base_pivot @ turn)
 
@@ -106,6 +109,7 @@ class PickMotionPlanner:
         """Return pre-grasp joints (6,), nearest to home first, or the first of the three poses out of reach."""
         T_lifted = _shift(placement.T_base_pivot, np.array([0.0, 0.0, self._config.lift_m]))
         branches: list[np.ndarray] = []
+        # The pre-grasp is last: its branches are the ones returned
         for name, T in (("grasp", placement.T_base_pivot), ("lifted pose", T_lifted), ("pre-grasp", T_pre)):
             branches = self._kinematics.solve(T)
             if not branches:
@@ -128,11 +132,13 @@ class PickMotionPlanner:
             stage=PlanningStage.APPROACH,
         )
         rejection = rejection or self._checker.check_closing(close)
+        # The lift leaves the object out, which is held and moves along
         rejection = rejection or self._checker.check_trajectory(
             lift, threshold_m=config.scene_threshold_m, stage=PlanningStage.LIFT
         )
         if rejection is not None:
             return rejection
+        # Last: a transfer to a grasp without approach or lift would be planned in vain
         transfer = self._plan_transfer(q_pre, T_pre)
         if isinstance(transfer, Rejection):
             return transfer

@@ -111,6 +111,7 @@ class _Search:
             if found.rejection is not None:
                 self.rejections[rank] = found.rejection
                 continue
+            # Tested here, since candidates without a placement do not count: their motion is not planned
             if n_tried == self._config.max_tried:
                 return None
             motion = self._motions.plan_first(found.placements)
@@ -128,10 +129,12 @@ class _Search:
             for placement in self._candidates.placements(rank).placements[:n_left]:
                 n_left -= 1
                 nearest = self._motions.nearest_reachable(placement)
+                # The grasp has joints: its lifted pose or its pre-grasp was out of reach
                 if nearest is None:
                     continue
                 motion = nearest if isinstance(nearest, Rejection) else self._motions.plan_first([nearest])
                 if isinstance(motion, PickMotion):
+                    # It was rejected in the first pass, for want of analytic joints
                     del self.rejections[rank]
                     return self._make_plan(rank, motion, "least_squares")
                 self._reject(rank, motion)

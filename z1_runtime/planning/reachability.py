@@ -141,6 +141,7 @@ class ReachabilityRanker:
         config = self._config
         distance = np.linalg.norm(candidates.contacts - centre, axis=1) / config.centring_m
         return (
+            # 0.61 at one `centring_m` from the centre
             config.centring * np.exp(-0.5 * distance**2)
             + config.support * candidates.support
             + config.level * candidates.level

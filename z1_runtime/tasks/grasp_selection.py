@@ -119,6 +119,7 @@ class GraspSelector:
         with times.stage("total"):
             observation = self.observe(frame, q, times)
             selection = self.select_from(observation, q, times)
+        # Copied again: the total ends only here
         return replace(selection, stage_ms=dict(times.ms))
 
     def select_from(self, observation: Observation, q: np.ndarray, times: StageTimes | None = None) -> GraspSelection:
@@ -187,6 +188,7 @@ class GraspSelector:
         ranking = ranking or self.ranking
         up = observation.T_base_camera[2, :3]  # the base's z axis in the camera frame
         box = fit_obb(observation.object_points, ranking.box_method, up=up)
+        # The paper: a_j > 0 on one of the k nearest faces, ordered by 0.85 · alignment + 0.15 · score
         ranked = rank_grasps(grasps, box, k=ranking.k_faces, alpha=ranking.alpha, hard_filter=ranking.hard_filter)
         if not len(ranked):
             raise NoPlanError(
@@ -230,6 +232,7 @@ class GraspSelector:
         if ranking is not None and ranking.box_method == "upright" and ranked is not None:
             box = ranked.box
         if box is None and ranking is not None and ranking.head is not None:
+            # A head's features are measured on the upright box, whatever box the filter used
             box = fit_upright_box(scene.observation)
         return GraspCandidates.from_grasps(
             grasps,

@@ -119,6 +119,7 @@ class PickTask:
         with self._phase("home"):
             self._go_home()
         with self._phase("look"):
+            # At rest first: a moving arm would pair the frame with the joints of another moment
             state = self.executor.settle()
             frame = self.camera.wait_for_frame(self.config.frame_timeout_s)
         with self._phase("decide"):
@@ -127,6 +128,7 @@ class PickTask:
         state = self._execute(selection.plan)
         jaw, torque = float(state.q[-1]), float(state.tau[-1])
         return PickResult(
+            # Negative is open: an object keeps the jaws from closing
             held=jaw < self.config.jaw_empty and abs(torque) > self.config.held_torque_nm,
             selection=selection,
             phases=tuple(self._phases),
@@ -166,6 +168,7 @@ class PickTask:
         for name, motion in motions.items():
             with self._phase(name):
                 self.executor.execute(motion)
+                # Each phase is planned from rest at the end of the one before
                 self.executor.settle()
         with self._phase("hold"):
             self.executor.execute(hold(plan.lift.q[-1], self.config.hold_s))

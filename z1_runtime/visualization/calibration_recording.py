@@ -50,6 +50,7 @@ class SolvedSamples:
 def write_recording(path: Path, solved: SolvedSamples) -> None:
     """Write `path` (.rrd): arm, board and all cameras in space; per sample the image with its corners."""
     stream = rr.RecordingStream("z1_calibration")
+    # As in `Recorder`: these timelines would double the size of every entry
     stream.set_log_time_enabled(False)
     stream.set_log_tick_enabled(False)
     stream.set_sinks(rr.FileSink(str(path)), default_blueprint=_blueprint())

@@ -44,6 +44,7 @@ class LiveView:
         self._arm = arm
         self._logger = logger
         self._T_flange_camera = T_flange_camera
+        # Its own: such an object belongs to one thread
         self._kinematics = ForwardKinematics()
         self._period_s = 1.0 / rate_hz
         self._closing = threading.Event()

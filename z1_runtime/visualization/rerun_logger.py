@@ -121,6 +121,7 @@ class RerunLogger:
 
     def log_stage_times(self, stage_ms: Mapping[str, float]) -> None:
         """Log the duration of each stage [ms]."""
+        # A copy: the worker draws it later
         times = dict(stage_ms)
         self._put(None, lambda: self._archetypes.draw_stage_times(times))
 

@@ -22,6 +22,7 @@ def split_turned_solid(outline: np.ndarray, rounding_m: float = 0.0) -> list[np.
         rounding_m: distance of the surface beyond the outline; only used without a hollow [m].
     """
     pieces = []
+    # To the micrometre, so that corners of one height are one level below
     outline = np.round(outline, 6)
     low, high = outline[:, 1].min(), outline[:, 1].max()
     for between, trapezia in _strips(outline):

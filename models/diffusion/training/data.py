@@ -50,6 +50,7 @@ class GraspData:
         bounds = np.cumsum(weights, axis=1)
         marks = rng.random((len(views), count)) * bounds[:, -1:]
         picks = np.stack([np.searchsorted(b, m) for b, m in zip(bounds, marks, strict=True)])
+        # A mark that rounding puts on the last bound is found one past the end
         picks = np.minimum(picks, self.grasps.shape[1] - 1)
         rows = np.arange(len(views))[:, None]
         return self.T_view_object[views][:, None] @ self.grasps[shapes[rows], picks], self.widths_m[shapes[rows], picks]

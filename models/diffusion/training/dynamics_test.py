@@ -119,6 +119,7 @@ def _build_model(solid: Solid, gripper: ParallelGripperSpec, config: DynamicsTes
 
     spec = mujoco.MjSpec()
     spec.option.timestep = _TIMESTEP_S
+    # Stiff friction rows, as in the twin: held objects would creep otherwise
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.impratio = 10.0
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
@@ -133,12 +134,15 @@ def _build_model(solid: Solid, gripper: ParallelGripperSpec, config: DynamicsTes
     for geom in body.geoms:
         geom.density = config.density_kg_m3
         geom.contype, geom.conaffinity = _OBJECT_BIT, _FINGER_BIT
+        # Torsional and rolling friction are MuJoCo's defaults
         geom.condim, geom.friction = 4, [gripper.friction, 0.005, 0.0001]
+        # The shortest time constant that MuJoCo integrates stably, two time steps
         geom.solref = [2.0 * _TIMESTEP_S, 1.0]
     model = spec.compile()
     weight = float(np.clip(model.body_mass[-1], *config.mass_kg) / model.body_mass[-1])
     model.body_mass[-1] *= weight
     model.body_inertia[-1] *= weight
+    # The constants that MuJoCo derives from masses follow the scaled ones
     mujoco.mj_setConst(model, mujoco.MjData(model))
     return model
 
@@ -162,6 +166,7 @@ def _add_gripper(spec: mujoco.MjSpec, gripper: ParallelGripperSpec, config: Dyna
             name=name,
             type=mujoco.mjtJoint.mjJNT_SLIDE,
             axis=[0.0, side, 0.0],
+            # At this speed the damping balances the force
             damping=[config.force_n / config.closing_speed_m_s, 0.0, 0.0],
         )
         finger.add_geom(size=size, pos=[0.0, side * size[1], -size[2]], mass=_FINGER_MASS_KG, **touch)

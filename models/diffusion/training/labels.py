@@ -180,6 +180,7 @@ def _check(parts, profiles, T, body, pads, half, clearance, cos_cone):  # noqa: 
         if left == np.inf:
             continue
         right, cos_right = _close_finger(parts, profiles, T[i], pads, -1.0, half)
+        # Fingers that meet have nothing between them
         if right == np.inf or left + right >= 2.0 * half:
             continue
         widths[i], offsets[i] = 2.0 * half - left - right, 0.5 * (right - left)

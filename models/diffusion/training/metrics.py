@@ -79,6 +79,7 @@ def measure_cloud(
     raw_valid = check_grasps(solid, T_raw, gripper, raw.widths_m).valid
     ray = points.mean(axis=0) / np.linalg.norm(points.mean(axis=0))
     kept = np.zeros(len(grasps), dtype=bool)
+    # The paper's filter: box by PCA, as no up direction is given, and k = 2
     kept[rank_grasps(grasps, fit_obb(points), k=2).indices] = True
     return CloudMetrics(
         family=solid.family,
@@ -122,6 +123,7 @@ def _coverage(ground_truth: np.ndarray, found: np.ndarray) -> float:
         return 0.0
     distance = np.linalg.norm(ground_truth[:, None, :3, 3] - found[None, :, :3, 3], axis=-1)
     approach = ground_truth[:, :3, 2] @ found[:, :3, 2].T
+    # Either closing direction is the same grasp
     closing = np.abs(ground_truth[:, :3, 1] @ found[:, :3, 1].T)
     near = (distance < _COVERAGE_M) & (approach > np.cos(_COVERAGE_RAD)) & (closing > np.cos(_COVERAGE_RAD))
     return float(near.any(axis=1).mean())

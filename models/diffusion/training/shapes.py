@@ -31,6 +31,7 @@ def _turn_outline(points: list[tuple[float, float]], rounding_m: float = 0.0, mi
     """Return an outline turned about z, closed along the axis, its middle at the origin."""
     low, high = points[0][1], points[-1][1]
     shift = (low + high) / 2.0 if middle else 0.0
+    # The rounding grows the outline, so it is inset by as much
     inset = [
         (max(r - rounding_m, 0.001), z - shift + (rounding_m if z == low else -rounding_m if z == high else 0.0))
         for r, z in points
@@ -104,6 +105,7 @@ def _lathe(u: Draw, rng: np.random.Generator) -> list[PartArrays]:
     height, widest = u(0.04, 0.22), u(0.015, 0.05)
     knots = rng.uniform(0.25, 1.0, int(rng.integers(3, 7)))
     at = np.linspace(0.0, 1.0, 14)
+    # A cubic spline overshoots its knots
     radii = widest * np.clip(CubicSpline(np.linspace(0.0, 1.0, len(knots)), knots)(at), 0.15, 1.1)
     return [_turn_outline([(float(r), float(z)) for r, z in zip(radii, at * height, strict=True)], 0.001)]
 

@@ -45,6 +45,7 @@ def make_shard(
             rows["shape"].append(len(rows["family"]))
         keep = rng.permutation(len(T))
         rows["n_grasps"].append(min(len(T), _MAX_GRASPS))
+        # Repeated where a shape has fewer: all shapes share one array
         keep = np.resize(keep, _MAX_GRASPS)
         rows["grasps"].append(T[keep].astype(np.float32))
         rows["widths_m"].append(widths[keep].astype(np.float32))

@@ -176,6 +176,7 @@ def _descend(
     for iteration in range(start, iterations):
         # Seeds for each iteration: a resumed run draws the same numbers as an uninterrupted one.
         rng = np.random.default_rng((seed, iteration))
+        # More than any number of iterations, so that two seeds share none
         torch.manual_seed(seed * 1_000_003 + iteration)
         for group in optimiser.param_groups:
             group["lr"] = rate * min(1.0, (iteration + 1) / 100) * _cosine(iteration / iterations)
@@ -185,6 +186,7 @@ def _descend(
         loss.backward()
         nn.utils.clip_grad_norm_(model.parameters(), 1.0)
         optimiser.step()
+        # A short memory at first, so that the random weights of the start are forgotten
         _follow(average, model, min(0.998, (iteration + 1) / (iteration + 50)))
         if (iteration + 1) % 250 == 0 or iteration + 1 == iterations:
             _save(checkpoint, model, average, optimiser, iteration + 1)
@@ -205,4 +207,5 @@ def _save(path: Path, model: nn.Module, average: nn.Module, optimiser: torch.opt
     partial = path.with_suffix(".partial")
     state = {"model": model.state_dict(), "average": average.state_dict(), "optimiser": optimiser.state_dict()}
     torch.save(state | {"iteration": iteration}, partial)
+    # Atomic: an interrupted write leaves the last checkpoint whole
     partial.replace(path)

@@ -95,6 +95,7 @@ def _render_depth(solid: Solid, T_camera_object: np.ndarray) -> tuple[np.ndarray
         if len(rows) == 0 or count == _FINE:
             break
         step = u[1] - u[0]
+        # A coarse ray wider: the outline is between the last ray that hits and the next
         window = (u[columns.min()] - step, u[columns.max()] + step, v[rows.min()] - step, v[rows.max()] + step)
     return rays, reach
 

@@ -29,6 +29,7 @@ class YoloDetector:
     def detect(self, frame: RgbdFrame, T_base_camera: np.ndarray) -> list[Detection]:
         """Return the detections that are not flat, faint ones included; see `Detector.detect`."""
         del T_base_camera
+        # A configured minimum below 0.1 stays in force
         found = self._detector.detect(frame.colour, min(_REPORT_CONFIDENCE, self.min_confidence))
         return [trim_mask(d, frame.depth_m) for d in found if not self._is_flat(d, frame.depth_m)]
 
