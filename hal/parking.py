@@ -17,8 +17,8 @@ from hal.servo.servo import Servo
 
 _LOG = logging.getLogger(__name__)
 _OWNER = "HAL parking"
-_POLL_S = 0.02
-_MAX_BRAKING_S = 2.0
+_POLL_S = 0.02  # each poll sends a heartbeat: 50 Hz, the rate of any client
+_MAX_BRAKING_S = 2.0  # as in `hal.process`: several times `ServoLimits.brake_s`
 _PROGRESS_PERIOD_S = 2.0
 _SPACING_S = 0.02
 _MIN_DURATION_S = 0.5
@@ -69,7 +69,7 @@ def park(servo: Servo, parking: Parking, abort: Event) -> bool:
 
 
 def _take_over(servo: Servo) -> None:
-    servo.release()
+    servo.release()  # of whichever client owns it; a motion of that client brakes
     servo.claim(_OWNER)
     pause, waited_s = Event(), 0.0
     while servo.status().mode in (ServoMode.TRACKING, ServoMode.BRAKING) and waited_s < _MAX_BRAKING_S:

@@ -94,7 +94,7 @@ def serve(
     with ExitStack() as undo:  # each step that was reached is undone, in reverse order
         connect_devices(servo, rig)
         undo.callback(servo.disconnect)
-        undo.callback(shutdown.disable_motors)
+        undo.callback(shutdown.disable_motors)  # undone after the last tick, see `ticking.stop` below
         undo.callback(rig.camera.disconnect)
         # After connecting: the guard takes a second to load, which a missing arm need not wait for.
         servo.set_safety_guard(Guard(workspace))
@@ -103,7 +103,7 @@ def serve(
         _await_first_tick(servo, ticking)
         server = undo.enter_context(HalServer(servo, rig.camera, rig.clock, config))
         if not monitor_only:
-            undo.callback(shutdown.bring_to_rest)
+            undo.callback(shutdown.bring_to_rest)  # undone first, while the servo ticks and clients can stop it
         _LOG.info("serving robot %s at %s", config.robot, config.endpoint)
         if on_ready is not None:
             on_ready()
@@ -179,7 +179,7 @@ class _ShutdownSequence:
         try:
             speed = np.abs(self._servo.read_state().dq[:N_ARM]).max()
         except HalError:
-            speed = 0.0
+            speed = 0.0  # a silent arm cannot be waited for
         return self._servo.status().mode is ServoMode.STOPPED and bool(speed < _AT_REST_RAD_S)
 
     def disable_motors(self) -> None:

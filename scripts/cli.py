@@ -11,6 +11,7 @@ from importlib.metadata import version
 
 from hal.base.errors import UsageError, Z1Error
 
+# Modules by name: a command loads only its own, neither the simulator nor the networks of the others.
 COMMANDS = {
     "demo": ("scripts.commands.run_demo", "pick an object with the twin, end to end"),
     "run": ("scripts.commands.run_runtime", "pick an object with a running HAL"),
@@ -73,6 +74,7 @@ def _run_guarded(name: str, arguments: list[str]) -> int:
         print("interrupted", file=sys.stderr)
         return INTERRUPTED
     except BrokenPipeError:  # `./z1 doctor | head` closes its end, which is no error
+        # Python flushes at exit, which would raise the error again.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return FAILED
     except Exception as error:

@@ -138,7 +138,7 @@ def load_frames(path: str | Path) -> list[RgbdFrame]:
         CameraError: the file holds no frames.
     """
     try:
-        with np.load(Path(path), allow_pickle=False) as data:
+        with np.load(Path(path), allow_pickle=False) as data:  # pickled objects could run code
             arrays = {name: data[name] for name in data.files}
         intrinsics = Intrinsics(
             width=int(arrays["intrinsics_width"]),
@@ -182,7 +182,7 @@ def make_demo_frames(n: int = 4) -> list[RgbdFrame]:
         frames.append(
             RgbdFrame(
                 colour=colour.astype(np.uint8),
-                depth_m=np.round(depth_m, 4),
+                depth_m=np.round(depth_m, 4),  # a D405's depth unit, 0.1 mm
                 intrinsics=intrinsics,
                 stamp_s=i * _PERIOD_S,
                 sequence=i,

@@ -17,12 +17,12 @@ from hal.base.messages import Intrinsics
 NAME = "Intel RealSense D405"
 USB_VENDOR, USB_PRODUCT = "8086", "0B5B"
 PRODUCT_LINE = "D400"
-FIRMWARE = "5.15.1.55"
+FIRMWARE = "5.15.1.55"  # of two real units
 SENSOR = "Stereo Module"
 """Name of the only sensor; colour, depth and infrared all come from it, and there is no "RGB Camera"."""
 DEPTH_UNIT_M = 1e-4
 """Depth unit of a new device [m]; drivers read it from the device, never from here."""
-BASELINE_M = 0.018
+BASELINE_M = 0.018  # datasheet; real units report 17.9 to 18.1 mm
 EXPOSURE_US = (1, 165_000, 33_000)
 """Minimum, maximum, default [µs]."""
 GAIN = (16, 248, 16)
@@ -46,7 +46,7 @@ MIN_Z_M = {
 
 def rates_hz(width: int, height: int) -> tuple[int, ...]:
     """Return the frame rates [Hz] over USB 3 at that resolution, the default first."""
-    return (30, 15, 5) if (width, height) == (1280, 720) else (30, 15, 60, 90, 5)
+    return (30, 15, 5) if (width, height) == (1280, 720) else (30, 15, 60, 90, 5)  # librealsense #11044
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -77,7 +77,7 @@ class D405Calibration:
 
     def depth(self, width: int, height: int) -> Intrinsics:
         """Return the pinhole of depth and infrared at that resolution."""
-        scale = 0.6 if _is_vga(width, height) else width / 1280
+        scale = 0.6 if _is_vga(width, height) else width / 1280  # real units' focal lengths have this ratio
         return _scaled(width, height, scale, (self.depth_focal_px, self.depth_focal_px), self.depth_centre_px)
 
     def colour(self, width: int, height: int) -> Intrinsics:
@@ -99,6 +99,7 @@ def _scaled(
         height=height,
         fx=scale * focal[0],
         fy=scale * focal[1],
+        # Other sizes are scaled and cropped about the middle of 1280×720, (640, 360).
         cx=width / 2 + scale * (centre[0] - 640),
         cy=height / 2 + scale * (centre[1] - 360),
     )

@@ -22,7 +22,7 @@ def frozen_array(value: Any, dtype: Any, shape: tuple[int | None, ...], name: st
     Raises:
         InvalidMessageError: wrong shape (`wrong_shape`), or a float that is not finite (`not_finite`).
     """
-    array = np.array(value, dtype=dtype)
+    array = np.array(value, dtype=dtype)  # a copy: the caller's own array stays writable
     wrong = array.ndim != len(shape) or any(
         want is not None and want != have for want, have in zip(shape, array.shape, strict=True)
     )

@@ -47,6 +47,7 @@ DDDQ_MAX = _constant(80.0, 80.0, 80.0, 120.0, 120.0, 120.0, 120.0)
 """(7,) highest joint jerk [rad/s³]."""
 
 # --- Position servo of the vendor's controller in JOINTCTRL (wire: 25.6 · K_P and 0.0128 · K_W) -------------
+# joint4's K_P was measured as 20 and as 25, without a known rule.
 KP = 25.6 * _constant(25, 30, 20, 20, 15, 30, 5)
 """(7,) stiffness [Nm/rad]."""
 KD = 0.0128 * _constant(2000, 3000, 3000, 3000, 2000, 2000, 100)
@@ -54,7 +55,7 @@ KD = 0.0128 * _constant(2000, 3000, 3000, 3000, 2000, 2000, 100)
 KP.setflags(write=False)
 KD.setflags(write=False)
 
-CONTROL_PERIOD_S = 0.002
+CONTROL_PERIOD_S = 0.002  # as the vendor's SDK; its maker calls the motors' RS-485 bus too slow for less (z1_sdk #8)
 """The client side of the wire runs at 500 Hz [s]."""
 
 # --- Poses --------------------------------------------------------------------------------------------------

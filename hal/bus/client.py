@@ -44,7 +44,7 @@ class RemoteArm:
         self._clock = clock or WallClock()
         self._link: BusLink | None = None
         self._states: Listener | None = None
-        self._newest = b""
+        self._newest = b""  # encoded: only a state that is read gets decoded
         self._arrived = threading.Event()
         self._heartbeat: _HeartbeatSender | None = None
 
@@ -165,7 +165,7 @@ class RemoteArm:
 
     def rearm(self) -> None:
         """Clear a latched stop (see `hal.base.arm.ServoedArm.rearm`)."""
-        self._connected().request(keys.REARM, owner=self._owner_name())
+        self._connected().request(keys.REARM, owner=self._owner_name())  # this frees the lease
         self._stop_heartbeat()
 
     # --- Inside ---------------------------------------------------------------------------------------------------
@@ -204,8 +204,8 @@ class _HeartbeatSender(BackgroundLoop):
         self._publisher = session.declare_publisher(
             keys.HEARTBEAT,
             priority=zenoh.Priority.REAL_TIME,
-            congestion_control=zenoh.CongestionControl.DROP,
-            express=True,
+            congestion_control=zenoh.CongestionControl.DROP,  # a late heartbeat is worth no more than the next one
+            express=True,  # sent at once, not collected into a batch
         )
 
     def _run(self) -> None:

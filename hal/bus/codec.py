@@ -92,7 +92,7 @@ def _split_message(message: Any) -> tuple[bytes, list[np.ndarray]]:
                     f"codec: {kind.__name__}.{name} has dtype {value.dtype} (allowed {want}).", code="invalid_dtype"
                 )
             plain[name] = list(value.shape)
-            arrays.append(np.ascontiguousarray(value))
+            arrays.append(np.ascontiguousarray(value))  # `memoryview.cast` takes contiguous memory only
     header: bytes = msgpack.packb([kind.__name__, plain])  # pyright: ignore[reportAssignmentType] (its stub is wrong)
     return _PREFIX.pack(_MAGIC, VERSION, 0, len(header)) + header, arrays
 
@@ -105,6 +105,7 @@ def encode(message: Any) -> bytes:
         InvalidMessageError: an array of another dtype than the message's (object arrays among them).
     """
     head, arrays = _split_message(message)
+    # A memoryview with a zero in its shape cannot be cast.
     return b"".join([head, *(array.data.cast("B") if array.size else b"" for array in arrays)])
 
 
@@ -112,7 +113,7 @@ def encode_into(message: Any, buffer: bytearray) -> None:
     """Write `message` to `buffer`, whose length is adapted; each array is copied once."""
     head, arrays = _split_message(message)
     total = len(head) + sum(array.nbytes for array in arrays)
-    if len(buffer) != total:
+    if len(buffer) != total:  # once for each camera: its frames have one size
         buffer[:] = bytes(total)
     buffer[: len(head)] = head
     with memoryview(buffer) as view:
@@ -215,7 +216,7 @@ def _check_field(value: Any, hint: Any, label: str) -> Any:
         if not isinstance(value, list):
             raise _invalid_field(label, value, "a list of texts")
         return tuple(_check_field(item, str, f"{label}[{i}]") for i, item in enumerate(value))
-    if type(value) is not hint:
+    if type(value) is not hint:  # not `isinstance`, by which True is an int
         raise _invalid_field(label, value, f"type {hint}")
     if hint is float and not math.isfinite(value):
         raise _invalid_field(label, value, "finite values")

@@ -12,7 +12,7 @@ from hal.base.errors import HalError
 _KINDS: dict[str, type[HalError]] = {
     name: kind for name, kind in inspect.getmembers(hal.base.errors, inspect.isclass) if issubclass(kind, HalError)
 }
-_MAX_TEXT = 4000
+_MAX_TEXT = 4000  # about forty times the longest text of ours: a bound, not a limit in use
 
 
 def encode_error(error: HalError) -> bytes:

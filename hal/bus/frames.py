@@ -67,6 +67,7 @@ class FrameBuffers:
     def __init__(self, intrinsics: Intrinsics, *, shared: bool) -> None:
         self._buffer = bytearray()
         before = existing_segments()
+        # The 4096 B are for the header of the encoded frame.
         size = _FRAMES_IN_POOL * (_BYTES_PER_PIXEL * intrinsics.width * intrinsics.height + 4096)
         self._provider = _make_provider(size) if shared else None
         # Not before the process ends: Zenoh's own records belong to it, and a later provider needs them too.

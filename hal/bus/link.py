@@ -39,10 +39,10 @@ class BusLink:
         self._device = device
         self._clock = clock
         self._queriers: dict[str, zenoh.Querier] = {}
-        self._lock = threading.Lock()
+        self._lock = threading.Lock()  # two threads may make the first request of one key at once
         before = existing_segments()
         self.session = open_session(config, listen=False)
-        self._segments = mapped_segments() - before
+        self._segments = mapped_segments() - before  # this session's own, which Zenoh would leave behind
         try:
             self.hello, self.clock_offset_s = self._handshake()
         except HalError:
@@ -92,7 +92,7 @@ class BusLink:
                     key,
                     timeout=self._config.request_timeout_s,
                     priority=zenoh.Priority.REAL_TIME,
-                    congestion_control=zenoh.CongestionControl.BLOCK,
+                    congestion_control=zenoh.CongestionControl.BLOCK,  # a command must not be dropped
                     express=True,
                 )
             return self._queriers[key]
@@ -111,5 +111,5 @@ class BusLink:
                     raise
                 pause.wait(_RETRY_S)
                 continue
-            offset_s = hello.now_s - 0.5 * (sent_s + self._clock.now_s())
+            offset_s = hello.now_s - 0.5 * (sent_s + self._clock.now_s())  # as if the HAL answered half-way
             return hello, 0.0 if abs(offset_s) < _SAME_CLOCK_S else offset_s

@@ -23,7 +23,7 @@ from hal.bus.service import Listener, as_bytes
 from hal.bus.session import BusConfig
 
 _LOG = logging.getLogger(__name__)
-_LATENCIES_KEPT = 1000
+_LATENCIES_KEPT = 1000  # half a minute at 30 Hz
 _FRAMES_WAITING = 2
 
 
@@ -126,7 +126,7 @@ class RemoteCamera:
             link = self._connected()
             self._waiting += 1
             if self._listener is None:
-                self._last_sequence = None
+                self._last_sequence = None  # frames of the time without a listener are not lost
                 self._listener = Listener(link.session, keys.FRAME, self._on_frame, waiting=_FRAMES_WAITING)
         try:
             while True:

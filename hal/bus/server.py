@@ -125,6 +125,7 @@ class HalServer:
         self._state = session.declare_publisher(keys.STATE, **urgent)
         self._status = session.declare_publisher(keys.STATUS, **urgent)
         self._health = session.declare_publisher(keys.HEALTH)
+        # Of lower priority than states and requests, which a frame of megabytes must not delay.
         self._frames = session.declare_publisher(
             keys.FRAME, priority=zenoh.Priority.DATA_LOW, congestion_control=zenoh.CongestionControl.DROP
         )

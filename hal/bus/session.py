@@ -16,7 +16,7 @@ from hal.bus.codec import MAX_BYTES
 _LOG = logging.getLogger(__name__)
 _MAX_COMMAND_BYTES = 8 * 2**20
 """Maximum message to the HAL process; the longest chunk (`hal.servo.trajectory_buffer.MAX_POINTS`) has 1.2 MB."""
-_ROBOT = re.compile(r"[A-Za-z0-9_-]{1,40}")
+_ROBOT = re.compile(r"[A-Za-z0-9_-]{1,40}")  # no character with a meaning in Zenoh's key expressions
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -86,7 +86,7 @@ def open_session(config: BusConfig, *, listen: bool) -> zenoh.Session:
     except zenoh.ZError as err:
         if not listen:
             raise no_answer_error(config) from err
-        if "in use" in str(err):
+        if "in use" in str(err):  # Zenoh has one class for all failures: only its text distinguishes them
             raise HalError(
                 f"bus: port {config.port} on {config.host} is taken by another HAL process or another program. End "
                 f"that one, or choose another port with `--port`.",
@@ -115,6 +115,7 @@ def _zenoh_config(config: BusConfig, *, listen: bool) -> zenoh.Config:
         "namespace": config.robot,
         "listen": ends if listen else none,
         "connect": none if listen else {**ends, "timeout_ms": int(1e3 * config.connect_timeout_s)},
+        # Explicit endpoints only: discovery would also find the HAL processes of other robots.
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
         "transport": {
             # By default Zenoh would gather a message of up to 1 GiB from any sender.

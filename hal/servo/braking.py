@@ -51,6 +51,7 @@ class Brake:
             inp.max_jerk = (factor * limits.dddq_max).tolist()
             self._ruckig.calculate(inp, path)
             extrema = path.position_extrema
+            # Each joint's own; `path.duration` is the slowest one's.
             late = np.array(path.independent_min_durations) > limits.brake_s
             outside = np.array([e.min for e in extrema]) < low
             outside |= np.array([e.max for e in extrema]) > high
@@ -95,6 +96,7 @@ def plan_path_stop(path: TrajectoryBuffer, start_s: float, limits: ServoLimits) 
 
     It lasts as long as the limits of acceleration and jerk need for the speed there, at most `brake_s`.
     """
+    # A stop of `brake_s` covers half of that in the path's own time, so the last sample is there.
     speed = np.abs([path.at(start_s + ratio * limits.brake_s)[1] for ratio in (0.0, 0.25, 0.5)]).max(axis=0)
     # Maxima of the slow-down 1 − 3u² + 2u³ over the duration T: acceleration 3/2 v/T, jerk 6 v/T².
     needed_s = np.max([1.5 * speed / limits.ddq_max, np.sqrt(6.0 * speed / limits.dddq_max)])

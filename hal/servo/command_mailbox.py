@@ -158,7 +158,7 @@ class CommandMailbox:
             self._check_start(chunk, snapshot)
             new = start_buffer(chunk, self._limits)
             self._check_guard(new, chunk, snapshot)
-            self.target, self.trajectory = None, new
+            self.target, self.trajectory = None, new  # last, after all checks: the tick may play it at once
 
     def send(self, setpoint: ArmSetpoint, owner: str | None, now_s: float, snapshot: Snapshot) -> None:
         """Set `setpoint` as the target (errors as `hal.servo.servo.Servo.send`)."""
@@ -175,6 +175,7 @@ class CommandMailbox:
                     f"guard: the setpoint {violation.text}. Command a pose inside the workspace.", code=violation.code
                 )
             self.target = Target(setpoint, now_s)
+            # Counted for the log, not rejected: the tick clips it.
             self.out_of_limits_count += bool(
                 ((setpoint.q < self._limits.q_min) | (setpoint.q > self._limits.q_max)).any()
             )

@@ -101,7 +101,7 @@ class ControlCycle:
     def _latch_fault(self, reason: str) -> None:
         """Latch the stop, as `Servo.stop` does: an operator has to inspect the arm before it moves again."""
         mailbox = self._mailbox
-        if not mailbox.latch:
+        if not mailbox.latch:  # the first reason stays, as in `CommandMailbox.stop`
             mailbox.cancel_reason = reason
             mailbox.latch = reason
 

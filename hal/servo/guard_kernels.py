@@ -60,7 +60,7 @@ def segment_distance(a, b, c, d):
         u, v, w = b[i] - a[i], d[i] - c[i], a[i] - c[i]
         uu, vv, uv, uw, vw = uu + u * u, vv + v * v, uv + u * v, uw + u * w, vw + v * w
     det = uu * vv - uv * uv
-    s = min(max((uv * vw - uw * vv) / det, 0.0), 1.0) if det > 1e-12 else 0.0
+    s = min(max((uv * vw - uw * vv) / det, 0.0), 1.0) if det > 1e-12 else 0.0  # parallel: any `s` will do
     t = (uv * s + vw) / vv
     if t < 0.0:
         t, s = 0.0, min(max(-uw / uu, 0.0), 1.0)
@@ -96,13 +96,14 @@ def measure_margins(q, joints, lower, upper, T_flange_pivot):
             for e in range(2):
                 _apply(links[_LINK[c]], _ENDS[c, e], ends[c, e])
                 if _MAY_MEET_TABLE[c]:
+                    # The lowest point of a capsule is below one of its ends.
                     table[k] = min(table[k], ends[c, e, 2] - _RADII[c])
         for i in range(len(CAPSULE_PAIRS)):
             one, other = CAPSULE_PAIRS[i, 0], CAPSULE_PAIRS[i, 1]
             gap = segment_distance(ends[one, 0], ends[one, 1], ends[other, 0], ends[other, 1])
             own[k] = min(own[k], gap - _RADII[one] - _RADII[other])
         _chain(links[6], T_flange_pivot, 1, 0.0, pivot)
-        _chain(pivot, unmoved, 1, q[k, 6], moving_jaw)
+        _chain(pivot, unmoved, 1, q[k, 6], moving_jaw)  # 1: the moving jaw turns about the pivot's y axis
         for i in range(len(GRIPPER_POINTS) + len(MOVING_JAW_POINTS)):
             if i < len(GRIPPER_POINTS):
                 _apply(pivot, GRIPPER_POINTS[i], point)

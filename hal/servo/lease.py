@@ -22,6 +22,7 @@ class Lease:
 
     def current_owner(self, now_s: float, *, at_rest: bool) -> str:
         """Return the owner at `now_s` [s]; empty when the lease is free or has lapsed."""
+        # Not in motion: there the tick brakes at a late heartbeat, and names the owner.
         lapsed = self._timeout_s is not None and at_rest and now_s - self.last_heartbeat_s > self._timeout_s
         return "" if lapsed else self.owner
 

@@ -80,7 +80,7 @@ def _request_real_time(cpu: int | None) -> tuple[str, ...]:
     gc.disable()
     gc.freeze()  # objects that exist by now are no garbage while the servo runs; skipping them keeps those pauses short
     try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_FIFO_PRIORITY))
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_FIFO_PRIORITY))  # 0: this thread alone
         granted.append("SCHED_FIFO")
     except OSError:
         denied.append("SCHED_FIFO")
@@ -110,4 +110,5 @@ def _lock_memory() -> bool:
         return False
     resource.setrlimit(resource.RLIMIT_MEMLOCK, (hard_limit, hard_limit))
     libc = ctypes.CDLL(None, use_errno=True)
+    # ONFAULT locks each page when it is first used, instead of the whole address space at once.
     return libc.mlockall(_MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT) == 0

@@ -17,9 +17,9 @@ from hal.servo.trajectory_buffer import TrajectoryBuffer
 
 _AT_REST_RAD_S = 0.02  # a trajectory whose last point is faster ends in motion and is braked
 _YIELD_THRESHOLD_RAD = 0.01  # below it the difference to the measurement is the servo's ordinary tracking error
-_ON_PATH_RAD = 1e-6
+_ON_PATH_RAD = 1e-6  # rounding; a command that was clipped or blended is further off
 _ZERO = np.zeros(N_JOINTS)
-_ZERO.setflags(write=False)
+_ZERO.setflags(write=False)  # shared by all commands at rest
 
 
 class JointCommand(NamedTuple):
@@ -73,7 +73,7 @@ class SetpointGenerator:
 
     def begin(self, new: TrajectoryBuffer) -> None:
         """Change over to a new trajectory from any state, by a blend."""
-        self.trajectory_id, self.trajectory_time_s = new.trajectory_id, -CONTROL_PERIOD_S
+        self.trajectory_id, self.trajectory_time_s = new.trajectory_id, -CONTROL_PERIOD_S  # `play` advances first: to 0
         self.mode, self.reason, self.finished = ServoMode.TRACKING, "", False
         self._start_blend(*new.at(0.0))
 
@@ -83,6 +83,7 @@ class SetpointGenerator:
 
     def has_underrun(self, active: TrajectoryBuffer) -> bool:
         """Return True when the buffer of an incomplete trajectory ends before this tick."""
+        # The tolerance covers the rounding of a sum of thousands of periods.
         return not active.final and self.trajectory_time_s + CONTROL_PERIOD_S > active.end_s + 1e-9
 
     def play(self, active: TrajectoryBuffer) -> JointCommand:

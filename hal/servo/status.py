@@ -58,6 +58,7 @@ def make_health(
         ticks=periods.ticks,
         overruns=periods.overruns,
         owner=owner,
+        # Another thread may record a heartbeat after `now_s` was read.
         command_age_s=max(now_s - mailbox.lease.last_heartbeat_s, 0.0) if owner else 0.0,
         real_time=real_time,
     )
@@ -69,7 +70,7 @@ class StatusLogger:
     def __init__(self) -> None:
         self._latch = ""
         self._clipped_count = 0
-        self._logged_s = -np.inf
+        self._logged_s = -np.inf  # the first clipped setpoint is logged at once
 
     def log_changes(self, latch: str, clipped_count: int, now_s: float) -> None:
         """Log the changes since the last call.

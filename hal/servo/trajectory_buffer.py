@@ -20,8 +20,8 @@ MAX_GAP_S = 0.05
 """Maximum time between the end of one chunk and the start of the next [s]."""
 MAX_POINTS = 10_000
 """Maximum number of buffered points: 20 s at the servo's rate. Checking more would delay a stop."""
-_SAME_TIME_S = 1e-6
-_KEEP_S = 0.1  # of points before the played time
+_SAME_TIME_S = 1e-6  # rounding of times; a control period is 2000 times as long
+_KEEP_S = 0.1  # of played points: the tick may still read the buffer a few periods behind the producer
 _POSITION_TOLERANCE_RAD = 1e-6  # rounding of a point on a joint limit
 _SPEED_TOLERANCE = 1.001  # difference quotients of a motion at full speed exceed it by rounding
 _SMOOTHNESS_TOLERANCE = 1.05  # cubics through samples of a smooth motion overshoot its acceleration a little
@@ -109,6 +109,7 @@ def extend_buffer(
         )
     # A chunk that repeats the last point adds it only once.
     skip = int(start - old.end_s <= _SAME_TIME_S)
+    # More than a joint covers in one period cannot be the rounding of a repeated point.
     if skip and np.abs(chunk.q[0] - old.q[-1]).max() > (limits.dq_max * CONTROL_PERIOD_S).min():
         jump = np.abs(chunk.q[0] - old.q[-1])
         raise CommandRejectedError(

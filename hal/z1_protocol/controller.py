@@ -34,6 +34,7 @@ STATE_PORT = 8072
 COMMAND_SIZE = 147
 STATE_SIZE = 208
 
+# Source of the defaults in LOWCMD: LowlevelCmd.h of the vendor's SDK.
 KP_LOWCMD = np.array([20.0, 30.0, 30.0, 20.0, 15.0, 10.0, 20.0])
 """(7,) the client's default gains in LOWCMD, in wire units."""
 KD_LOWCMD = np.full(z1.N_JOINTS, 2000.0)
@@ -42,6 +43,7 @@ KP_JOINTCTRL = z1.KP / KP_SCALE
 """(7,) the controller's gains in JOINTCTRL, in wire units."""
 KD_JOINTCTRL = z1.KD / KD_SCALE
 """(7,) the controller's damping gains in JOINTCTRL, in wire units."""
+# Measured at the motor board's end of the vendor's controller, which leaves the gripper undamped.
 KD_PASSIVE = np.array([10.0, 100.0, 300.0, 10.0, 10.0, 10.0, 0.0])
 """(7,) the controller's damping gains in PASSIVE, where the gains are 0; in wire units."""
 LABELS = {
@@ -53,7 +55,7 @@ for _constant in (KP_LOWCMD, KD_LOWCMD, KP_JOINTCTRL, KD_JOINTCTRL, KD_PASSIVE, 
     _constant.setflags(write=False)
 
 # Layouts as measured on the vendor's controller; all are packed and little-endian.
-_HEAD = b"\xfe\xff"
+_HEAD = b"\xfe\xff"  # `head[2]` of both of the vendor's structures
 _COMMAND_HEAD = struct.Struct("<2siB")
 _STATE_HEAD = struct.Struct("<2si")
 _POSE = struct.Struct("<6d")
@@ -191,6 +193,7 @@ def decode_command(data: bytes | memoryview) -> Command:
     Raises:
         ProtocolError: wrong size, head, state or flag.
     """
+    # Stricter than the vendor's controller, which obeys commands of 148 B and a track flag of 2 as well (measured).
     _check_size(data, COMMAND_SIZE, "a command")
     head, state, track = _COMMAND_HEAD.unpack_from(data)
     _check_head(head, state)
@@ -223,16 +226,16 @@ def decode_state(data: bytes | memoryview) -> ControllerState:
     head, state = _STATE_HEAD.unpack_from(data)
     _check_head(head, state)
     pose = np.array(_POSE.unpack_from(data, _POSE_AT))
-    if not (np.abs(pose) <= _MAX_POSE).all():
+    if not (np.abs(pose) <= _MAX_POSE).all():  # true for a NaN, too
         raise ProtocolError(
             f"the gripper's pose is {pose}; allowed are finite values within ±{_MAX_POSE:g}.", code="implausible_value"
         )
-    records = np.frombuffer(bytes(data[_JOINTS_AT:_POSE_AT]), JOINT_STATE)
+    records = np.frombuffer(bytes(data[_JOINTS_AT:_POSE_AT]), JOINT_STATE)  # a copy: the link reuses its buffer
     return ControllerState(state=Fsm(state), joints=unpack_states(records), pose=pose)
 
 
 def _pack_label(label: str) -> bytes:
-    packed = label.encode("ascii", "replace")
+    packed = label.encode("ascii", "replace")  # `isascii` below rejects the replaced ones
     if not 1 <= len(packed) <= _LABEL_SIZE or not label.isascii() or not label.isprintable() or " " in label:
         raise ProtocolError(
             f"the label {label!r} cannot be sent; allowed are 1 to {_LABEL_SIZE} printable ASCII characters.",

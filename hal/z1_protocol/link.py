@@ -55,7 +55,7 @@ class UdpLink:
         self._local = local
         self._socket: socket.socket | None = None
         self._poll = select.poll()
-        self._buffer = memoryview(bytearray(_MAX_DATAGRAM))
+        self._buffer = memoryview(bytearray(_MAX_DATAGRAM))  # reused: the servo's loop allocates nothing
         self._failure = ""
 
     def open(self) -> None:
@@ -63,7 +63,7 @@ class UdpLink:
             return
         opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
-            opened.setblocking(False)
+            opened.setblocking(False)  # the servo's tick must never wait in `recv`
             opened.bind(self._local)
             opened.connect(self._remote)
         except OSError as error:
@@ -104,6 +104,7 @@ class UdpLink:
         return f"{_join(self._remote)} (answers to {_join(self._local)}){self._failure}"
 
     def _record(self, error: OSError) -> None:
+        # On a connected UDP socket this is the peer's ICMP message "port unreachable".
         if error.errno == errno.ECONNREFUSED:
             self._failure = "; that machine reports that nothing listens on the port"
         else:

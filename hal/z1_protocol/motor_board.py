@@ -106,7 +106,7 @@ def decode_state(data: bytes | memoryview) -> JointStates:
     """
     if len(data) in STATE_SIZES:
         return unpack_states(np.frombuffer(bytes(data), JOINT_STATE))
-    if len(data) in OLD_STATE_SIZES:
+    if len(data) in OLD_STATE_SIZES:  # the vendor's controller accepts it, too (measured)
         return unpack_states(np.frombuffer(bytes(data), JOINT_STATE_OLD))
     raise ProtocolError(
         f"the motor board's state has {len(data)} bytes; allowed are {STATE_SIZES + OLD_STATE_SIZES}.",

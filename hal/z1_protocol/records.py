@@ -30,7 +30,7 @@ KD_SCALE = 0.0128
 
 # Several times the capability of a Z1, so that a real but unusual measurement is never rejected.
 _FIELDS = ("tau", "dq", "ddq", "q")
-_PLAUSIBLE = np.array([300.0, 100.0, 1e5, 50.0])
+_PLAUSIBLE = np.array([300.0, 100.0, 1e5, 50.0])  # [Nm, rad/s, rad/s², rad]
 
 
 class ProtocolError(HalError, ValueError):
@@ -159,7 +159,7 @@ def unpack_states(records: np.ndarray) -> JointStates:
 
 def _pack(values: JointCommands | JointStates, dtype: np.dtype, names: tuple[str, ...]) -> np.ndarray:
     records = np.zeros(len(values.q), dtype=dtype)
-    with np.errstate(over="ignore", invalid="ignore"):
+    with np.errstate(over="ignore", invalid="ignore"):  # the check below names the joint, which a warning would not
         for name in names:
             records[name] = getattr(values, name)
     for name in names:

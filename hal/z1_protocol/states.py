@@ -51,6 +51,7 @@ MOVES = frozenset(
 )
 """States in which the controller moves (or saves) by itself; done, it falls back to JOINTCTRL."""
 
+# Measured: MOVEJ is ignored in PASSIVE, and LOWCMD is granted there alone.
 _FROM_PASSIVE = {Fsm.JOINTCTRL, Fsm.CARTESIAN, Fsm.BACKTOSTART, Fsm.LOWCMD, Fsm.CALIBRATION}
 _FROM_LOWCMD = {Fsm.JOINTCTRL, Fsm.PASSIVE}
 _FROM_MOVING = {Fsm.JOINTCTRL, Fsm.PASSIVE}

@@ -70,6 +70,7 @@ def solve(detected: DetectedSamples, camera: CameraModel) -> HandEyeResult:
     board = detected.info.board
     poses = [estimate_board_pose(view, board, camera).T_camera_board for view in detected.views]
     return solve_hand_eye(
+        # Without samples the shape is (0, 4, 4), for the solver to reject.
         np.array([sample.T_base_flange for sample in detected.samples]).reshape(-1, 4, 4),
         np.array(poses).reshape(-1, 4, 4),
         setup=detected.info.setup,
@@ -121,6 +122,7 @@ def _show_error(result: HandEyeResult, ground_truth: np.ndarray, console: Consol
 
     error_m, error_rad = pose_error(ground_truth, result.T_mount_camera)
     error_mm, error_deg = 1e3 * error_m, float(np.rad2deg(error_rad))
+    # Both, as `scripts.measure.measure_calibration` counts.
     inside = error_mm <= result.uncertainty_mm and error_deg <= result.uncertainty_deg
     console.print(
         f"against the twin's ground truth: [bold]{error_mm:.3f} mm, {error_deg:.4f}°[/], "

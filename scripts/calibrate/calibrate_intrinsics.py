@@ -70,6 +70,7 @@ def show_result(result: IntrinsicsResult, stated: CameraModel, console: Console)
         table.add_row(f"{name} [px]", f"{estimated:.3f}", f"{result.sd[number]:.3f}", f"{own:.3f}")
     for number, name in enumerate(("k1", "k2", "p1", "p2", "k3")):
         estimated, own = result.camera.distortion[number], stated.distortion[number]
+        # The first four deviations are the camera matrix's.
         table.add_row(name, f"{estimated:.5f}", f"{result.sd[4 + number]:.5f}", f"{own:.5f}")
     console.print(table)
     kept = len(result.view_names) - len(result.rejected)

@@ -46,7 +46,7 @@ def read_samples(folder: Path, console: Console) -> DetectedSamples:
     for name, sample in zip(loaded.names, loaded.samples, strict=True):
         try:
             view = detect_board(sample.image, loaded.info.board)
-        except CalibrationError as error:
+        except CalibrationError as error:  # one view without a board must not discard the others
             console.print(f"[yellow]sample {name} is left out:[/] {error}", soft_wrap=True)
             continue
         detected.names.append(name)

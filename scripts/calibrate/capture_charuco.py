@@ -104,7 +104,7 @@ def capture(config: Config, console: Console, read_key: Callable[[], Key] | None
             console.print(
                 f"{n} of {config.poses} samples are kept; `--out {folder}` goes on from there", soft_wrap=True
             )
-            raise
+            raise  # so that the command ends with the exit code of Ctrl-C
     return folder, len(session.captured)
 
 
@@ -125,6 +125,7 @@ def read_terminal_key() -> Key:
     if not select.select([sys.stdin], [], [], 0.0)[0]:
         return ""
     line = sys.stdin.readline()
+    # Nothing, not even a newline: the input has ended.
     return "end" if not line or line.strip().lower().startswith("q") else "take"
 
 
@@ -133,7 +134,7 @@ def twin_ground_truth(ground_truth: Callable[[], GroundTruth] | None) -> dict | 
     if ground_truth is None:
         return None
     poses = ground_truth()
-    assert poses.T_base_board is not None
+    assert poses.T_base_board is not None  # the scene was made with a board
     return {"T_mount_camera": poses.T_flange_camera.tolist(), "T_anchor_board": poses.T_base_board.tolist()}
 
 

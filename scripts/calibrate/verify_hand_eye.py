@@ -69,6 +69,7 @@ def main(config: Config, ask: Ask = input) -> int:
     check_config = TipCheckConfig(n=config.corners, height_m=config.height_m, speed=config.speed)
     with ExitStack() as undo:
         robot = undo.enter_context(open_robot(config.robot, config.board, config.seed))
+        # A frame has the serial number by which its calibration is found.
         extrinsics = find_extrinsics(robot.camera.wait_for_frame(5.0).serial, config.calibration, config.calibrations)
         console.print(f"camera: {extrinsics.origin}", soft_wrap=True)
         robot.arm.claim("verify")
@@ -102,6 +103,7 @@ def _offset_mm(measurement: TipMeasurement, config: Config, robot: CalibrationRo
         assert T_base_board is not None
         p_board_tip = transform_points(inverse(T_base_board), measurement.p_base_tip)
         offset = p_board_tip - config.board.corners_m[measurement.corner]
+        # The board's z axis points into it: a tip above the print is at a negative z.
         return 1e3 * np.array([offset[0], offset[1], -offset[2] - config.height_m])
     while answer := ask(f"corner {measurement.corner}: offset of the tip to the right and down [mm], like 0.5 -1 ? "):
         try:

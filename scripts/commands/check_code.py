@@ -35,4 +35,5 @@ def main(config: CheckConfig) -> int:
 
 def _passes(step: list[str]) -> bool:
     print(f"$ {' '.join(step)}", flush=True)
+    # By the interpreter: the tools of this environment, whatever PATH has.
     return subprocess.run([sys.executable, "-m", *step], cwd=ROOT, check=False).returncode == 0

@@ -88,7 +88,7 @@ def main(config: Config) -> int:
     console = Console(highlight=False)
     try:
         _run(tasks, config.jobs, store, console)
-    finally:
+    finally:  # also after Ctrl-C: the rows of finished scenarios are kept
         if rows := store.rows():
             store.write_table()
             run = {"version": version("z1-grasp"), "command": plain(asdict(config)), "search": asdict(search)}
@@ -119,6 +119,7 @@ def _load_bench_rows(folder: Path | None) -> list[Row]:
         return []
     import pyarrow.parquet as pq
 
+    # The oracle is no method of its own comparison.
     return [row for row in pq.read_table(folder / TABLE).to_pylist() if row["method"] != METHOD]
 
 

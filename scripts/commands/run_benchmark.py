@@ -129,7 +129,7 @@ def main(config: Config) -> int:
     rows, summary = [], {}
     try:
         _run(tasks, config, store, console)
-    finally:
+    finally:  # also after Ctrl-C: the rows of finished episodes are kept
         rows = store.rows()
         if rows:
             store.write_table()
@@ -138,7 +138,7 @@ def main(config: Config) -> int:
             write_report(rows, summary, report)
             _print_summary(console, summary)
     if pictures := _draw_pictures(rows, config, runtime, shapes):
-        write_report(rows, summary, report, pictures)
+        write_report(rows, summary, report, pictures)  # again, with links: the first one is there if drawing fails
     console.print(f"rows: {config.out}/episodes.parquet, figures: {config.out}/summary.json and report.html")
     return _exit_code(summary, config.out, console)
 

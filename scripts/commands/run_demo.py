@@ -175,7 +175,7 @@ def _pick(
         summary |= summarise(robot, result, truth)
     except HalError as error:
         if process is not None and (reason := process.exit_reason()):
-            raise HalError(reason, code="hal_process_ended") from error
+            raise HalError(reason, code="hal_process_ended") from error  # the cause; a broken link is its effect
         raise
     return truth
 

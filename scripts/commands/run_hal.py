@@ -81,7 +81,7 @@ def main(config: Config) -> int:
                 from sim_twin.ground_truth import GroundTruthServer
 
                 stack.callback(GroundTruthServer(config.bus, rig.world).close)
-            print(READY, flush=True)
+            print(READY, flush=True)  # `HalProcess` waits for this line
 
         serve(
             rig,
@@ -104,6 +104,7 @@ def make_rig(config: Config) -> Rig:
         InvalidValueError: the scene is out of range.
     """
     name = config.rig.name
+    # Read-only holds for the driver as well as for the servo: no datagram of it may command the arm.
     arm = replace(config.arm, mode=Z1Mode.OBSERVE) if config.readonly else config.arm
     if name not in TWINS:
         return RIGS.make(name, arm=arm)  # the twin is not imported

@@ -61,6 +61,7 @@ class Config:
 
 def main(arguments: list[str]) -> int:
     """Run the script and return its exit code."""
+    # Options in front of the script are this command's, those behind it the script's own.
     end = next((i for i, argument in enumerate(arguments, start=1) if argument.endswith(".py")), len(arguments))
     config = tyro.cli(Config, prog="z1 twin run-script", description=__doc__, args=arguments[:end])
     if not config.file.is_file():
@@ -111,7 +112,7 @@ def wire_robot(scene: SceneConfig, start: Literal["home", "startFlat"]) -> Itera
     from sim_twin.drop_in.process import WireProcess
     from sim_twin.drop_in.rig import free_ports
 
-    command_port, state_port = free_ports()
+    command_port, state_port = free_ports()  # the vendor's may be in use by a real controller
     twin = WireProcess(scene, WireConfig(command_port=command_port, state_port=state_port), start_pose(start))
     atexit.register(twin.close)  # runs after the script's own exit handlers, which disconnect its arm
     twin.start()
@@ -158,6 +159,6 @@ def run_program(file: Path, arguments: list[str]) -> int:
     except SystemExit as ended:
         if ended.code is None or isinstance(ended.code, int):
             return ended.code or 0
-        print(ended.code, file=sys.stderr)
+        print(ended.code, file=sys.stderr)  # as Python: any other value is printed, and the exit code is 1
         return 1
     return 0

@@ -12,5 +12,5 @@ def main(arguments: list[str]) -> int:
     """Run pytest with `arguments` (default: everything that needs no hardware) and return its exit code."""
     import pytest
 
-    os.chdir(ROOT)
+    os.chdir(ROOT)  # pytest's settings are in its pyproject.toml
     return int(pytest.main(arguments))

@@ -77,7 +77,7 @@ def main(config: Config) -> int:
     from sim_twin.benchmark.tuning.report import write_tuning_report
     from z1_runtime.grasping.ranking import save_scoring
 
-    require_sklearn()
+    require_sklearn()  # first: a missing package is reported before the logs are read
     logs = load_logs(config.logs)
     console = Console(highlight=False)
     tuning = tune(

@@ -14,7 +14,7 @@ import sys
 from importlib import import_module
 
 _STEPS = {"run-script": "scripts.commands.run_script", "wire": "scripts.commands.run_wire"}
-_BAD_USAGE = 2
+_BAD_USAGE = 2  # as `scripts.cli.BAD_USAGE`
 
 
 def main(arguments: list[str]) -> int:

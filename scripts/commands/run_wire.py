@@ -103,6 +103,7 @@ def start_pose(start: Literal["startFlat", "home"]) -> np.ndarray | None:
 
     from hal.z1_protocol.controller import LABELS
 
+    # Jaws closed, as BACKTOSTART leaves them (measured).
     return np.append(LABELS["startFlat"], 0.0) if start == "startFlat" else None
 
 

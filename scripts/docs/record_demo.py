@@ -107,6 +107,7 @@ def draw_frames(scene: SceneConfig, result: PickResult, snapshots: Sequence[Snap
     data = mujoco.MjData(model)
     renderer = make_renderer(model, d405.INTRINSICS)
     kinematics, selection = Kinematics(), result.selection
+    # The decision comes right before it, and takes no time on the twin's clock.
     transfer_s = next(phase.start_s for phase in result.phases if phase.name == "transfer")
     frames: list[Image.Image] = []
     try:
@@ -140,14 +141,16 @@ def write_webp(frames: Sequence[Image.Image], config: Config) -> None:
         duration=durations,
         loop=0,
         quality=config.quality,
-        method=6,
+        method=6,  # the slowest and smallest of Pillow's
         minimize_size=True,
     )
 
 
 def _record(robot: Devices, snapshots: list[Snapshot], period_s: float) -> None:
     t_s = robot.clock.now_s()
+    # The tolerance covers the rounding of the clock's sum of periods.
     if not snapshots or t_s >= snapshots[-1].t_s + period_s - 1e-6:
+        # A copy of the positions, which MuJoCo changes in place.
         snapshots.append(Snapshot(t_s=t_s, qpos=robot.world.data.qpos.copy(), q=robot.arm.read_state().q))
 
 
@@ -173,7 +176,7 @@ def _overlay(colour: np.ndarray, T_base_camera: np.ndarray, result: PickResult, 
 
 def _phase_at(result: PickResult, t_s: float) -> str:
     """Return the name of the phase at `t_s`."""
-    return [phase.name for phase in result.phases if phase.start_s <= t_s + 1e-6][-1]
+    return [phase.name for phase in result.phases if phase.start_s <= t_s + 1e-6][-1]  # rounding, as in `_record`
 
 
 def _join(outside: np.ndarray, wrist: np.ndarray, text: str) -> Image.Image:

@@ -36,7 +36,7 @@ def draw_overlay(
 ) -> np.ndarray:
     """Return `colour` (H, W, 3) uint8 with `layers` of `selection` as the camera at `T_base_camera` sees them."""
     picture = colour.copy()
-    T_base_first = selection.observation.T_base_camera
+    T_base_first = selection.observation.T_base_camera  # of the decision; the camera has moved on since
     if layers.points:
         _draw_points(picture, _project(selection.observation.object_points, T_base_first, T_base_camera, intrinsics))
     if layers.box and selection.ranked.box is not None:
@@ -46,7 +46,7 @@ def draw_overlay(
     if layers.ranked:
         grasps = selection.ranked.grasps[:_N_RANKED]
         strips = gripper_strips(grasps.T_camera_grasps, grasps.widths_m)
-        for rank in reversed(range(len(strips))):
+        for rank in reversed(range(len(strips))):  # the first-ranked is drawn last, on top
             ratio = rank / _N_RANKED
             strip = _project(strips[rank], T_base_first, T_base_camera, intrinsics)
             _draw_line(picture, strip, (int(40 + 200 * ratio), int(210 * (1 - ratio)), 60), 1)
@@ -86,7 +86,7 @@ def _project(points: np.ndarray, T_base_points: np.ndarray, T_base_camera: np.nd
 def _draw_points(picture: np.ndarray, pixels: np.ndarray) -> None:
     pixels = np.round(pixels[np.isfinite(pixels).all(axis=1)]).astype(int)
     height, width = picture.shape[:2]
-    inside = ((pixels >= 0) & (pixels < [width - 1, height - 1])).all(axis=1)
+    inside = ((pixels >= 0) & (pixels < [width - 1, height - 1])).all(axis=1)  # less one pixel, as 2 × 2 are drawn
     u, v = pixels[inside].T
     for du, dv in np.ndindex(2, 2):  # 2 × 2 pixels: the picture is shown at three quarters of the camera's size
         picture[v + dv, u + du] = _MASK

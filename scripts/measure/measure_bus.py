@@ -35,7 +35,7 @@ from hal.bus.session import BusConfig, open_session
 from hal.process import serve, stop_on_signals
 from hal.rig import Rig
 
-_INTRINSICS = Intrinsics(width=640, height=480, fx=390.0, fy=390.0, cx=319.5, cy=239.5)
+_INTRINSICS = Intrinsics(width=640, height=480, fx=390.0, fy=390.0, cx=319.5, cy=239.5)  # about a D405's
 _CHUNK_PERIOD_S = 0.02
 
 
@@ -76,13 +76,13 @@ def _add(table: Table, name: str, values: np.ndarray) -> None:
 def hal_process() -> Iterator[BusConfig]:
     """Run `serve_mock` in a process of its own on a free port."""
     with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
+        probe.bind(("127.0.0.1", 0))  # 0: a free port of the system's choice
         port = probe.getsockname()[1]
     command = [sys.executable, "-c", f"from scripts.measure.measure_bus import serve_mock; serve_mock({port})"]
     with subprocess.Popen(command, stdout=subprocess.PIPE) as process:
         try:
             assert process.stdout is not None
-            if not process.stdout.readline():
+            if not process.stdout.readline():  # "ready", or nothing when it has ended
                 raise HalError("the HAL process ended before it served; its error is above.")
             yield BusConfig(port=port)
         finally:
@@ -95,7 +95,7 @@ def serve_mock(port: int) -> None:
     stop_on_signals(ended)
     clock = WallClock()
     rig = Rig(arm=MockArm(clock), camera=ReplayCamera(make_frames(), clock=clock), clock=clock)
-    serve(rig, BusConfig(port=port), ended, on_ready=lambda: print("ready", flush=True))
+    serve(rig, BusConfig(port=port), ended, on_ready=lambda: print("ready", flush=True))  # `hal_process` waits for it
 
 
 def make_frames(n: int = 4) -> list[RgbdFrame]:
@@ -121,7 +121,7 @@ def measure_frames(config: BusConfig, seconds: float, *, shared: bool) -> tuple[
     """Return the latencies (N,) of frames from sending and from exposure [ms], and whether memory was shared."""
     clock, exposed_ms = WallClock(), []
     with RemoteCamera(BusConfig(port=config.port, shared_memory=shared), clock) as camera:
-        for _ in range(round(30 * seconds)):
+        for _ in range(round(30 * seconds)):  # the recording's rate, 30 Hz
             frame = camera.wait_for_frame(2.0)
             exposed_ms.append(1e3 * (clock.now_s() - frame.stamp_s))
         return np.array(camera.frame_latencies_ms), np.array(exposed_ms), camera.shared_memory
@@ -133,10 +133,10 @@ def measure_chunks(config: BusConfig, seconds: float) -> np.ndarray:
     with RemoteArm(config, owner="measure_bus") as arm:
         arm.claim()
         status = arm.status()
-        q = np.tile(status.q_command, (6, 1))
+        q = np.tile(status.q_command, (6, 1))  # at rest: the link is measured, not the motion
         for count in range(1, round(seconds / _CHUNK_PERIOD_S)):
             chunk = TrajectoryChunk(
-                trajectory_id=status.trajectory_id + count,
+                trajectory_id=status.trajectory_id + count,  # a new one each, which has no seam to fit
                 t_s=np.linspace(0, 0.1, 6),
                 q=q,
                 dq=np.zeros((6, N_JOINTS)),
@@ -172,6 +172,7 @@ def measure_states(config: BusConfig, seconds: float) -> np.ndarray:
     clock: Clock = WallClock()
     arrived_s: list[float] = []
     with open_session(config, listen=False) as session:
+        # 16 may wait: at the default of 1 a burst would lose arrivals.
         listener = Listener(session, keys.STATE, lambda _: arrived_s.append(clock.now_s()), waiting=16)
         clock.sleep_until(clock.now_s() + seconds)
         listener.close()

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from z1_runtime.collision.scene_collision import CollisionChecker
 
 MOUNT_ERROR_M, MOUNT_ERROR_DEG = 0.005, 2.0
-_SILENT = Console(file=io.StringIO())
+_SILENT = Console(file=io.StringIO())  # for the output of each capture
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,7 +74,7 @@ def main(config: Config) -> int:
         for seed in range(config.first, config.first + config.runs):
             rows.append(_run(config, seed, console))
             file.write(json.dumps(rows[-1]) + "\n")
-            file.flush()
+            file.flush()  # an interrupted measurement keeps its rows
     good = _show_runs(rows, console) if rows else True
     if config.demos:
         _demos(config, console)
@@ -122,6 +122,7 @@ def _capture(config: Config, seed: int, folder: Path) -> DetectedSamples:
         mount_seed=seed,
     )
     if config.drive:
+        # Full speed: each sample is taken at rest all the same.
         options = capture_charuco.Config(out=folder, poses=config.poses, seed=seed, speed=1.0, robot=robot)
         capture_charuco.capture(options, _SILENT)
     else:
@@ -162,7 +163,7 @@ def _blur_joints(observed: DetectedSamples, sd_rad: float, seed: int) -> None:
     """Recompute the arm pose of each sample from joints with a measurement error."""
     from z1_runtime.geometry.kinematics import Kinematics
 
-    kinematics, rng = Kinematics(), np.random.default_rng([seed, 1])
+    kinematics, rng = Kinematics(), np.random.default_rng([seed, 1])  # not the stream of the board's place
     for number, sample in enumerate(observed.samples):
         q = sample.q[:6] + rng.normal(0.0, sd_rad, 6)
         observed.samples[number] = replace(sample, T_base_flange=kinematics.flange(q))
@@ -174,7 +175,7 @@ def _corrupt(observed: DetectedSamples, n: int, console: Console) -> None:
     wrong = np.random.default_rng(0).choice(len(samples), n, replace=False)
     for number in wrong:
         T = samples[number].T_base_flange.copy()
-        T[:3, 3] += [0.006, -0.008, 0.0]
+        T[:3, 3] += [0.006, -0.008, 0.0]  # 10 mm in all
         samples[number] = replace(samples[number], T_base_flange=T)
     result = solve(replace(observed, samples=samples), observed.info.camera)
     assert observed.info.ground_truth is not None
@@ -215,6 +216,7 @@ def _demos(config: Config, console: Console) -> None:
         with (config.out / "demos.jsonl").open("w") as file:
             for name, path in mounts.items():
                 for object_ in ("bottle", "box", "cylinder"):
+                    # The three objects share the demos.
                     for number, lateral_m in enumerate((0.0, -0.1, 0.1)[: config.demos // 3]):
                         success = _demo(object_, lateral_m, number, path, Path(folder) / "demo")
                         lifted[name] += success
@@ -263,7 +265,7 @@ def _demo(object_: str, lateral_m: float, seed: int, calibration: Path, out: Pat
         seed=seed,
         mount_error_m=MOUNT_ERROR_M,
         mount_error_deg=MOUNT_ERROR_DEG,
-        mount_seed=0,
+        mount_seed=0,  # the mount that `_mounts` calibrates
     )
     options = run_demo.Config(scene=scene, lockstep=True, calibration=calibration, out=out)
     try:

@@ -17,7 +17,7 @@ from models.types import GraspSet
 
 N_POINTS = 5000
 N_GRASPS = 800
-UP = np.array([0.0, -1.0, 0.0])
+UP = np.array([0.0, -1.0, 0.0])  # in the camera frame, whose y points down
 
 
 def make_box_view(rng: np.random.Generator) -> np.ndarray:
@@ -35,7 +35,7 @@ def make_random_grasps(rng: np.random.Generator) -> GraspSet:
     """Return 800 grasps with rotations uniform over all directions, near the box."""
     T = np.tile(np.eye(4), (N_GRASPS, 1, 1))
     q, _ = np.linalg.qr(rng.normal(size=(N_GRASPS, 3, 3)))
-    T[:, :3, :3] = q * np.linalg.det(q)[:, None, None]
+    T[:, :3, :3] = q * np.linalg.det(q)[:, None, None]  # −1 times a reflection is a rotation
     T[:, :3, 3] = [0.0, 0.05, 0.4]
     return GraspSet(T_camera_grasps=T, scores=rng.uniform(size=N_GRASPS), widths_m=np.full(N_GRASPS, 0.06))
 

@@ -76,7 +76,7 @@ def main(options: Options) -> None:
     with tempfile.TemporaryDirectory() as folder:
         command, kind = _bare_command(Path(folder), n)
         with (
-            _run_load(options.load, Path(folder)) as detections,
+            _run_load(options.load, Path(folder)) as detections,  # first: both loops then run under it from their start
             subprocess.Popen(command, stdout=subprocess.PIPE) as bare,
         ):
             before = detections()
@@ -171,7 +171,7 @@ def run_vision() -> None:
     while True:
         detector.detect(frame, T_base_camera)
         sys.stdout.buffer.write(b".")
-        sys.stdout.buffer.flush()
+        sys.stdout.buffer.flush()  # the file's size is the count
 
 
 class _TimedServo(Servo):
@@ -179,7 +179,7 @@ class _TimedServo(Servo):
 
     def __init__(self, arm: MockArm, clock: WallClock, capacity: int) -> None:
         super().__init__(arm, clock)
-        self.woke_s, self.cost_ms, self.played_s = np.zeros((3, capacity))
+        self.woke_s, self.cost_ms, self.played_s = np.zeros((3, capacity))  # a tick must allocate nothing
         self.count = 0
 
     def tick(self) -> None:
@@ -195,7 +195,8 @@ class _TimedServo(Servo):
 def _run_servo(options: Options) -> tuple[np.ndarray, str]:
     """Return the periods [ms] of a moving servo, and a summary of its status."""
     clock = WallClock()
-    capacity = round(1.2 * options.seconds / CONTROL_PERIOD_S)
+    capacity = round(1.2 * options.seconds / CONTROL_PERIOD_S)  # a reserve: the thread ticks a little longer
+    # From the middle of all ranges the swing of 0.4 rad stays within the joint limits.
     servo = _TimedServo(MockArm(clock, q=(Q_MIN + Q_MAX) / 2), clock, capacity)
     servo.connect()
     servo.claim("measure_servo")
@@ -224,7 +225,7 @@ def _swing(servo: Servo, ended: threading.Event) -> None:
     start_s, sent_s = servo.clock.now_s(), 0.0
     while not ended.is_set():
         t_s = sent_s + np.linspace(0, 0.1, 6)
-        angle = 0.2 * (1 - np.cos(t_s))
+        angle = 0.2 * (1 - np.cos(t_s))  # 1 − cos: from rest
         q = centre + angle[:, None] * np.ones(N_JOINTS)
         dq = (0.2 * np.sin(t_s))[:, None] * np.ones(N_JOINTS)
         servo.stream(TrajectoryChunk(trajectory_id=1, t_s=t_s, q=q, dq=dq))

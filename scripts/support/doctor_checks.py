@@ -69,6 +69,7 @@ class Check:
 
 def check_python() -> Check:
     version = platform.python_version()
+    # The range of pyproject.toml; pyrealsense2 has wheels up to 3.14.
     if (3, 11) <= sys.version_info[:2] <= (3, 14):
         return Check("python", State.OK, f"{version}, {sys.executable}")
     return Check("python", State.MISSING, version, "sudo apt install python3.11, then rm -rf .venv and ./z1 --version")
@@ -88,6 +89,7 @@ def check_usb_library() -> Check:
 
 
 def check_processors() -> Check:
+    # The cores that this process may use, such as a container's; not every system has the call.
     usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     found = f"{usable} cores, {platform.machine()}"
     if usable < 2:
@@ -148,7 +150,7 @@ def _our_hal(config: BusConfig) -> str:
 
 
 def check_viewer_port() -> Check:
-    return _check_port("viewer port", 9876, "close the other live view")
+    return _check_port("viewer port", 9876, "close the other live view")  # Rerun's default
 
 
 def check_graphics() -> Check:
@@ -160,7 +162,7 @@ def check_graphics() -> Check:
     code, out = _run_python(program, timeout_s=20.0, MUJOCO_GL="egl", PYOPENGL_PLATFORM="egl")
     if code != 0:
         return Check("graphics", State.WARN, f"no OpenGL through EGL: {_last_line(out)}", fix)
-    software = any(word in out.lower() for word in ("llvmpipe", "softpipe", "swrast"))
+    software = any(word in out.lower() for word in ("llvmpipe", "softpipe", "swrast"))  # Mesa's renderers on the CPU
     return Check("graphics", State.OK, f"EGL, {_last_line(out)}{' (software)' if software else ''}")
 
 
@@ -281,7 +283,7 @@ def _limits_fix(right: str) -> str:
 
 def _check_port(name: str, port: int, fix: str) -> Check:
     with socket.socket() as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # a port whose last user has just ended is free
         try:
             probe.bind(("127.0.0.1", port))
         except OSError as error:
@@ -293,7 +295,7 @@ def _run_python(program: str, timeout_s: float, **environment: str) -> tuple[int
     """Run `program` in a process of its own, as drivers may hang or crash it; return exit code and output."""
     try:
         done = subprocess.run(
-            [sys.executable, "-P", "-c", program],
+            [sys.executable, "-P", "-c", program],  # -P: no module of the working directory
             capture_output=True,
             text=True,
             timeout=timeout_s,

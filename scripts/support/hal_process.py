@@ -14,7 +14,7 @@ from scripts.support.scene_options import SceneOptions
 
 READY = "ready"
 """Line that a HAL process prints when it accepts requests."""
-_SHUTDOWN_S = 10.0
+_SHUTDOWN_S = 10.0  # braking takes under 1 s; the rest is for Zenoh and the renderer
 _EXIT_S = 0.5  # the link may break before the process has exited
 
 
@@ -39,6 +39,7 @@ class HalProcess:
                 start_new_session=True,  # Ctrl-C reaches this process only, which then ends the child in order
             )
         assert self._process.stdin is not None
+        # Stays open: its end ends the child, also when this process is killed.
         self._process.stdin.write(encode_options(hal, scene, bus))
         self._process.stdin.flush()
 
@@ -49,7 +50,7 @@ class HalProcess:
             HalError: it ended instead; the message is its own.
         """
         assert self._process.stdout is not None
-        if self._process.stdout.readline().decode().strip() != READY:
+        if self._process.stdout.readline().decode().strip() != READY:  # an empty line: it has ended
             self._process.wait()
             raise HalError(self.exit_reason())
         self._ready = True

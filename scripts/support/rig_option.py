@@ -8,7 +8,7 @@ from typing import Annotated
 import tyro
 
 _EXCLUSIVE = tyro.conf.create_mutex_group(required=False, title="hardware")
-_Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff, _EXCLUSIVE]
+_Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff, _EXCLUSIVE]  # without `--no-sim`, which would select nothing
 
 DEFAULT = "sim"
 

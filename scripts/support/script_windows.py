@@ -14,8 +14,8 @@ import numpy as np
 
 from hal.base.clock import Clock
 
-_ESC = 27
-_NO_KEY = -1
+_ESC = 27  # with q, the key by which OpenCV's and librealsense's examples end
+_NO_KEY = -1  # OpenCV's own value
 _SILENT = ("namedWindow", "resizeWindow", "moveWindow", "setWindowTitle", "setWindowProperty", "setMouseCallback")
 _SILENT += ("createTrackbar", "setTrackbarPos", "destroyWindow", "destroyAllWindows", "startWindowThread")
 
@@ -40,6 +40,7 @@ class Windows:
 
     def wait_key(self, delay_ms: int = 0) -> int:
         """Wait as OpenCV does and return a key's code, or −1."""
+        # OpenCV waits for ever at 0; here no operator could press a key.
         self._clock.sleep_until(self._clock.now_s() + 1e-3 * max(delay_ms, 1))
         if not self._frames or self._shown < self._frames:
             return _NO_KEY
@@ -60,14 +61,15 @@ class Windows:
 @contextmanager
 def windows_as_files(folder: Path, clock: Clock, frames: int) -> Iterator[Windows | None]:
     """Replace the windows of an OpenCV built without any, and write them to `folder` at the end."""
-    if not re.search(r"GUI:\s+NONE", cv2.getBuildInformation()):
+    if not re.search(r"GUI:\s+NONE", cv2.getBuildInformation()):  # else not opencv-python-headless: real windows
         yield None
         return
     windows = Windows(clock, frames)
     ours: dict[str, Any] = dict.fromkeys(_SILENT, lambda *args, **kwargs: None)
     ours |= {"imshow": windows.show, "waitKey": windows.wait_key, "waitKeyEx": windows.wait_key}
+    # 1.0 = visible: scripts that poll the property would take any other value for a closed window.
     ours |= {"pollKey": lambda: windows.wait_key(0), "getWindowProperty": lambda *args: 1.0}
-    before = {name: getattr(cv2, name) for name in ours if hasattr(cv2, name)}
+    before = {name: getattr(cv2, name) for name in ours if hasattr(cv2, name)}  # a build without windows may lack some
     for name, function in ours.items():
         setattr(cv2, name, function)
     try:

@@ -90,6 +90,7 @@ def _shape(model: mujoco.MjModel, geom: int) -> Any:
     solid = rr.components.FillMode.Solid
     match kind:
         case mujoco.mjtGeom.mjGEOM_CYLINDER:
+            # MuJoCo's lengths are halves.
             return rr.Cylinders3D(lengths=[2 * size[1]], radii=[size[0]], colors=colour, fill_mode=solid)
         case mujoco.mjtGeom.mjGEOM_MESH:
             return _mesh(model, int(model.geom_dataid[geom]), rgba)

@@ -64,9 +64,9 @@ def main(config: Config) -> None:
         view = None
         rng = np.random.default_rng(config.seed)
         while view is None:
-            view = render_view(solid, _VIEW, rng)
+            view = render_view(solid, _VIEW, rng)  # None with too few visible points
         points, T_camera_object = view
-        grasps = sampler.sample(points, 800, config.seed)
+        grasps = sampler.sample(points, 800, config.seed)  # as many as in the benchmark
         grasps = grasps[spread_over_directions(grasps, config.grasps)]
         T_object_grasps = inverse(T_camera_object) @ grasps.T_camera_grasps
         valid = check_grasps(solid, T_object_grasps, gripper, grasps.widths_m).valid
@@ -98,7 +98,7 @@ def spread_over_directions(grasps: GraspSet, count: int) -> np.ndarray:
     """Return indices (count,) of grasps, each the maximum of score times distance to all approaches chosen so far."""
     approach, scores = grasps.T_camera_grasps[:, :3, 2], grasps.scores
     chosen = [0]
-    distance = np.full(len(grasps), 2.0)
+    distance = np.full(len(grasps), 2.0)  # the maximum between unit vectors
     while len(chosen) < min(count, len(grasps)):
         distance = np.minimum(distance, np.linalg.norm(approach - approach[chosen[-1]], axis=1))
         chosen.append(int(np.argmax(distance * scores)))

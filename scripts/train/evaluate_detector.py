@@ -46,8 +46,8 @@ TARGETS = {
 VIEW_IOU = 0.8
 _MIN_CONFIDENCE, _MAX_DETECTIONS = 0.001, 300
 """Limits of the average precision, with every class of a box: those of ultralytics' validator."""
-_JAW_RAD = -1.0
-_STAGE_SEED = 4_000_000
+_JAW_RAD = -1.0  # `RuntimeConfig.jaw_home`
+_STAGE_SEED = 4_000_000  # outside of `make_detection_dataset.SPLITS`
 _COLOURS = {"bottle": (255, 60, 255), "box": (60, 230, 60), "cylinder": (255, 80, 60)}
 
 
@@ -158,6 +158,7 @@ def draw_twin_views() -> Iterator[tuple[Scenario, LabelledImage]]:
             quat = np.empty(4)
             mujoco.mju_mat2Quat(quat, pose[:3, :3].ravel().copy())
             data.qpos[z1.N_JOINTS :] = [*pose[:3, 3], *quat]
+            # Rendering needs poses and lights alone, without the dynamics of mj_forward.
             mujoco.mj_kinematics(world.model, data)
             mujoco.mj_comPos(world.model, data)
             mujoco.mj_camlight(world.model, data)
@@ -202,7 +203,7 @@ def measure_views(detector: YoloModel, views: Iterator[tuple[Scenario, LabelledI
         mask = best.mask if best is not None else None
         ground_truth = picture.labels[0].mask if picture.labels else np.zeros(picture.colour.shape[:2], dtype=bool)
         ious[scenario.key] = 0.0 if mask is None else mask_iou(mask, ground_truth)
-        if number % 27 == 13:
+        if number % 27 == 13:  # the middle of each object's 27 poses
             tiles.append(draw_found(picture.colour, found))
     passed = sum(1 for iou in ious.values() if iou >= VIEW_IOU)
     failed = {key: _round(iou) for key, iou in ious.items() if iou < VIEW_IOU}
@@ -214,7 +215,7 @@ def measure_views(detector: YoloModel, views: Iterator[tuple[Scenario, LabelledI
 def measure_time(detector: YoloModel, repeats: int) -> dict[str, object]:
     """Return the median latency at 640×480 [ms]."""
     image = next(draw_twin_views())[1].colour
-    detector.detect(image)
+    detector.detect(image)  # the first run loads and compiles
     times = []
     for _ in range(repeats):
         watch = Stopwatch()
@@ -226,6 +227,7 @@ def measure_time(detector: YoloModel, repeats: int) -> dict[str, object]:
 def write_sheet(detector: YoloModel, data: Path, tiles: list[np.ndarray], path: Path) -> None:
     """Write a sheet of detections: some scenario views, then some held-out pictures."""
     images = _list_images(data, "val")
+    # Ten, spread over the shards, which have different props.
     held_out = [read_image(image) for image in images[:: max(len(images) // 10, 1)][:10]]
     tiles = tiles + [draw_found(colour, detector.detect(colour)) for colour in held_out]
     small = [cv2.resize(tile, (320, 240), interpolation=cv2.INTER_AREA) for tile in tiles]

@@ -128,6 +128,7 @@ def draw_clouds(
 def measure_latency(generator: GraspGenerator, samples: int) -> dict:
     """Return the latency of scored samples from 2,000 points [s]."""
     angle, height = np.random.default_rng(0).uniform(size=(2, 2000))
+    # The visible half of the twin's cylinder: radius 30 mm, height 150 mm.
     points = np.stack([0.03 * np.cos(np.pi * angle), 0.15 * height, 0.4 - 0.03 * np.sin(np.pi * angle)], axis=1)
     times = []
     for seed in range(12):

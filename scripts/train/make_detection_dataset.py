@@ -76,7 +76,7 @@ def main(config: Config) -> None:
     config.out.mkdir(parents=True, exist_ok=True)
     write_manifest(config)
     if config.jobs > 1 and len(shards) > 1:
-        with get_context("spawn").Pool(config.jobs) as pool:
+        with get_context("spawn").Pool(config.jobs) as pool:  # forked ones would inherit OpenGL's state
             for _ in track(pool.imap_unordered(make_shard, shards), description="shards", total=len(shards)):
                 pass
         return
@@ -101,12 +101,13 @@ def make_shard(shard: Shard) -> None:
     from sim_twin.detection_data.scene_renderer import SceneRenderer
     from sim_twin.detection_data.scenes import draw_scene
 
-    images = shard.out / "partial" / f"{shard.seed}.{os.getpid()}"
+    images = shard.out / "partial" / f"{shard.seed}.{os.getpid()}"  # two runs may make the same shard
     labels = shard.out / "labels" / shard.split / str(shard.seed)
     images.mkdir(parents=True)
     labels.mkdir(parents=True, exist_ok=True)
     renderer = SceneRenderer(shard.seed)
     for number in range(shard.count):
+        # 2: the props are drawn from the stream [seed, 1].
         picture = draw_scene(renderer, np.random.default_rng([shard.seed, 2, number]), shard.mix)
         name = f"{number:04d}_{picture.appearance}"
         _write_picture(picture, images / f"{name}.jpg", labels / f"{name}.txt")
@@ -115,7 +116,7 @@ def make_shard(shard: Shard) -> None:
         shutil.rmtree(images)
     else:
         shard.folder.parent.mkdir(parents=True, exist_ok=True)
-        images.rename(shard.folder)
+        images.rename(shard.folder)  # last: a shard that exists is complete
 
 
 def write_manifest(config: Config) -> None:
@@ -138,6 +139,7 @@ def to_line(label: Label) -> str:
     height, width = label.mask.shape
     outlines, _ = cv2.findContours(label.mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
     parts = [outline.reshape(-1, 2) for outline in outlines if len(outline) > 2]
+    # The outline of one or two pixels is no polygon; repeated corners make it one.
     parts = parts or [np.repeat(outlines[0].reshape(-1, 2), 3, axis=0)[:3]]
     corners = parts[0] if len(parts) == 1 else np.concatenate(merge_multi_segment([p.ravel().tolist() for p in parts]))
     ratios = (corners + 0.5) / [width, height]

@@ -51,6 +51,7 @@ def main(config: Config) -> None:
         )
     if config.processes > 1:
         _train_together(config)
+    # After `_train_together` all phases are complete: it only finds them.
     write_weights(config, train(config, manifest))
 
 
@@ -82,6 +83,7 @@ def _train_as_peer(rank: int, config: Config, rendezvous: str) -> None:
     end_with_parent()
     from torch import distributed
 
+    # gloo is torch's backend for CPUs; a rendezvous by a file needs no free port.
     distributed.init_process_group("gloo", init_method=rendezvous, rank=rank, world_size=config.processes)
     train(config, config.data / "data.yaml")
     distributed.destroy_process_group()
@@ -94,7 +96,7 @@ def end_with_parent() -> None:
 
     def wait() -> None:
         parent.join()
-        os._exit(1)
+        os._exit(1)  # sys.exit would end this thread alone
 
     Thread(target=wait, daemon=True).start()
 

@@ -76,6 +76,7 @@ def main(config: Config) -> None:
         stem.with_suffix(".generator.pt"),
         reporter.report("generator"),
         symmetric=gripper.symmetric,
+        # The generator alone: the discriminator learns from samples of the new one.
         start_from=load_weights(config.start_from)[0] if config.start_from else None,
     )
     labelling, seed = config.training.labelling, config.training.seed
@@ -172,6 +173,7 @@ class _CurveRecorder:
         def record(iteration: int, value: float) -> None:
             recent.append(value)
             if iteration % _REPORT_EVERY == 0:
+                # A resumed run repeats the iterations since its last checkpoint.
                 before = [(i, v) for i, v in self.curves.get(name, []) if i < iteration]
                 self.curves[name] = [*before, (iteration, round(sum(recent) / len(recent), 4))]
                 self._path.write_text(json.dumps(self.curves))

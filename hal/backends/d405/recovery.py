@@ -47,7 +47,7 @@ class RecoveryPolicy:
     def on_silence(self, duration_s: float) -> RecoveryStep | None:
         """Return the step to take after another `duration_s` [s] without a frame; None = wait on."""
         self._silent_s += duration_s
-        if self._silent_s < self._silence_s - 1e-6:
+        if self._silent_s < self._silence_s - 1e-6:  # rounding of the summed durations
             return None
         self._silent_s = 0.0
         following = {
@@ -91,7 +91,7 @@ class StampConverter:
         last, self._last = self._last, (device_s, now_s)
         if -self._JITTER_S <= now_s - stamp_s <= self._max_age_s:
             self._offset_count, self._age_s = 0, max(now_s - stamp_s, 0.0)
-            return min(stamp_s, now_s)
+            return min(stamp_s, now_s)  # the jitter may put an exposure after its arrival
         if last is not None:
             at_usual_rate = device_s > last[0] and now_s - last[1] > 0.5 * (device_s - last[0])
             self._offset_count = self._offset_count + 1 if at_usual_rate else 0

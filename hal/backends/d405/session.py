@@ -17,7 +17,7 @@ from hal.base.messages import Intrinsics
 
 logger = logging.getLogger(__name__)
 
-_GRID_PX = 8
+_GRID_PX = 8  # 0.01 px from the exact map, see `alignment_maps`
 _ALIGNED_AT_M = 0.3  # any distance gives the same map, as colour and depth share one imager
 _USB_DEVICES = Path("/sys/bus/usb/devices")
 
@@ -198,6 +198,7 @@ class D405Session:
         """Set exposure time [µs] and gain, on the stereo module, the D405's only sensor; None, None = automatic."""
         option = self._rs.option
         automatic = exposure_us is None and gain is None
+        # Global time: stamps in Unix time, which `StampConverter` expects.
         values = {option.global_time_enabled: 1.0, option.enable_auto_exposure: float(automatic)}
         if not automatic:
             values[option.exposure] = float(d405.EXPOSURE_US[-1] if exposure_us is None else exposure_us)
@@ -222,7 +223,7 @@ class D405Session:
     def is_torn(self, frame: RawFrame) -> bool:
         """Return whether colour and depth are of different instants: a stalled colour stream repeats its last image."""
         interval_s = abs(1e-3 * frame.colour.get_timestamp() - frame.device_s)
-        return interval_s > 0.5 / self._config.rate_hz
+        return interval_s > 0.5 / self._config.rate_hz  # images of one exposure are about 0.3 ms apart (field log)
 
     def images(self, frame: RawFrame) -> tuple[np.ndarray, np.ndarray]:
         """Return colour (H, W, 3) uint8 and depth (H, W) float32 [m], both with the pinhole `intrinsics`."""
@@ -240,6 +241,7 @@ class D405Session:
         if c.colour == "colour":
             request.enable_stream(rs.stream.color, c.width, c.height, rs.format.rgb8, c.rate_hz)
         else:
+            # Index 0: the rectified left imager in colour; 1 and 2 are both imagers in grey.
             request.enable_stream(rs.stream.infrared, 0, c.width, c.height, rs.format.rgb8, c.rate_hz)
         try:
             return self._pipeline.start(request, self._queue)
@@ -255,7 +257,7 @@ class D405Session:
         depth = profile.get_stream(rs.stream.depth).as_video_stream_profile()
         optics = depth.get_intrinsics()
         self.depth_scale = self._sensor.get_depth_scale()
-        if not 0.0 < self.depth_scale < 0.01:
+        if not 0.0 < self.depth_scale < 0.01:  # up to 100 times the unit of a new device, 0.1 mm
             raise CameraError(
                 f"D405 {self.serial}: the depth unit is {self.depth_scale} m; allowed is 0 to 0.01 m. Reset it.",
                 code="invalid_optics",

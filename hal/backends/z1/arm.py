@@ -81,7 +81,7 @@ class Z1Arm:
             client = self._client
             client.open(self.config.connect_timeout_s)
             found = client.newest.state
-            self._commands.grip_nm = None
+            self._commands.grip_nm = None  # torque control of an earlier connection must not persist
             try:
                 self._modes.start(self.config.mode)
             except HalError:

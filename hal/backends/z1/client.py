@@ -88,7 +88,7 @@ class Z1Client:
         self.cancelled = False
         """Set by another thread, without the lock: every wait in here ends at once."""
         self._left_count = 0
-        self._visited: set[Fsm] = set()
+        self._visited: set[Fsm] = set()  # a motion that is not possible shows its state for one cycle only (measured)
         self._newest: ControllerState | None = None
         self.newest_s = self.changed_s = self.sent_s = -np.inf
         """Times of the newest answer, of the last change of a measurement, and of the last command sent [s]."""
@@ -266,6 +266,8 @@ class Z1Client:
             if self.cancelled:
                 raise CommandRejectedError("Z1: the request was interrupted by a stop.", code="cancelled")
             self.send(data)
+            # The controller reads one datagram a cycle of about 2 ms: faster ones queue up, and are obeyed ever later
+            # (measured).
             self.clock.sleep_until(self.sent_s + CONTROL_PERIOD_S)
             self.receive()
             if reached():

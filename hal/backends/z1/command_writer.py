@@ -24,7 +24,7 @@ _MAX_LEAD_RAD = 0.35  # above the servo's following-error limit, so that the ser
 # The controller repeats its last measurement while its motor board is silent (measured on the vendor's controller).
 _STALE_S = 0.1
 _STALE_RAD = 0.05
-_STILL_RAD = 0.001
+_STILL_RAD = 0.001  # a command that moved less is at rest, where measurements may repeat
 _GRIPPER = z1.N_ARM
 _REST = np.zeros(z1.N_JOINTS)
 _REST.setflags(write=False)
@@ -127,6 +127,7 @@ class CommandWriter:
             self._write_motors(allowed)
             return allowed.q, allowed.dq
         joints = self._client.command.joints
+        # While tracking, the controller reads these two alone; gains and gravity torque are its own (measured).
         joints["q"] = q
         joints["dq"] = dq
         self._client.command.set_head(Fsm.INVALID, track=True)

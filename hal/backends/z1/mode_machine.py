@@ -154,7 +154,7 @@ class ModeMachine:
         Raises:
             HalError: the controller does not confirm; holding is requested nevertheless.
         """
-        self._client.cancelled = False
+        self._client.cancelled = False  # the stop's own requests below must not be cancelled
         if self.mode is None:
             return
         try:

@@ -74,7 +74,7 @@ class ControllerMotions:
         if not self._modes.moving:
             raise CommandRejectedError("Z1: the motion was stopped before its end.", code="motion_stopped")
         if state in MOVES:
-            client.send()
+            client.send()  # the controller falls to PASSIVE after 2.2 s without a datagram (measured)
             return state
         self._modes.resume()
         if state is not Fsm.JOINTCTRL:

@@ -30,7 +30,7 @@ def limit_commands(commands: JointCommands, states: JointStates, limits: ServoLi
             raise InvalidMessageError(f"Z1: motor {name} is {getattr(commands, name)}; it must be finite.")
     tau_max = limits.tau_max.copy()
     tau_max[z1.N_ARM] = min(tau_max[z1.N_ARM], limits.grip_torque_nm)
-    kp, kd = np.maximum(commands.kp, 0.0), np.maximum(commands.kd, 0.0)
+    kp, kd = np.maximum(commands.kp, 0.0), np.maximum(commands.kd, 0.0)  # a negative gain would amplify each deviation
     q = np.clip(commands.q, limits.q_min, limits.q_max)
     dq = np.clip(commands.dq, -limits.dq_max, limits.dq_max)
     dq[q != commands.q] = 0.0  # at a joint limit the speed would only push into it

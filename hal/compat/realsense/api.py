@@ -140,14 +140,14 @@ class pipeline(rs.pipeline):
             RuntimeError: the requested camera is not connected.
         """
         if isinstance(request, config) and request.is_file:
-            return rs.pipeline()
+            return rs.pipeline()  # `set_device` takes precedence over a file, so the engine must be a plain one
         twin = _twin_for(request)
         if twin is not None:
             if isinstance(request, config):
                 request.name_all_streams()
             self.set_device(twin.handle)
             self._had_twin = True
-        elif self._had_twin:
+        elif self._had_twin:  # `set_device` cannot be undone: this pipeline would stream from the old twin
             raise RuntimeError(_NO_DEVICE)
         return self
 
@@ -167,6 +167,7 @@ class pipeline(rs.pipeline):
 
     def _describe_timeout(self, timeout_ms: int) -> str:
         if self._twin is not None and not self._twin.present:
+            # librealsense's own text, in which the timeout follows without a space.
             return f"Device disconnected. Failed to reconnect: {_NO_DEVICE}{timeout_ms}"
         return f"Frame didn't arrive within {timeout_ms}"
 
@@ -248,7 +249,7 @@ class device_list(list):
         try:
             return super().__getitem__(index)
         except IndexError:
-            raise IndexError from None
+            raise IndexError from None  # without a text, as the library's own
 
     def _end(self, index: int) -> rs.device:
         if not self:

@@ -25,6 +25,7 @@ FORMATS = {
 }
 """(stream, index) to format to (bytes a pixel, OpenCV's conversion from RGB)."""
 
+# Source: librealsense's rs405_device.
 _DEFAULTS = {
     (848, 480, 30, rs.stream.depth, rs.format.z16),
     (848, 480, 30, rs.stream.color, rs.format.rgb8),
@@ -57,7 +58,7 @@ def add_sensor(handle, serial: str, calibration: D405Calibration):
     _register_identity(handle, serial)
     _add_options(sensor)
     _add_profiles(sensor, calibration)
-    handle.create_matcher(rs.matchers.default)
+    handle.create_matcher(rs.matchers.default)  # as librealsense's rs405_device does
     return sensor
 
 
@@ -73,7 +74,7 @@ def _register_identity(handle, serial: str) -> None:
         info.physical_port: f"twin/{serial}",
         info.product_id: d405.USB_PRODUCT,
         info.product_line: d405.PRODUCT_LINE,
-        info.usb_type_descriptor: "3.2",
+        info.usb_type_descriptor: "3.2",  # as real units report at a USB 3 port
         info.camera_locked: "YES",
     }.items():
         handle.register_info(key, value)
@@ -121,7 +122,7 @@ def _register_extrinsics(added: dict[tuple, list], calibration: D405Calibration)
     for (stream, index), profiles in added.items():
         pose = rs.extrinsics()  # of the depth axes in the stream's
         rotation = calibration.R_colour_depth if stream == rs.stream.color else np.eye(3)
-        pose.rotation = rotation.ravel(order="F").tolist()
+        pose.rotation = rotation.ravel(order="F").tolist()  # librealsense's matrices are column-major
         pose.translation = [-d405.BASELINE_M if index == 2 else 0.0, 0.0, 0.0]
         for profile in profiles:
             if profile is not first:

@@ -96,7 +96,7 @@ class TwinDevice:
                 clock.sleep_until(due_s)
                 self._deliver(number)
                 self._report_presence()
-        except Exception:
+        except Exception:  # every type: a twin without its thread would seem to hang
             logger.exception("D405 twin %s: the optics failed; it has left the bus", self.serial)
             self._ended.set()
             self._report_presence()
@@ -159,7 +159,7 @@ class TwinDevice:
         offset_s = unix_offset_s(self.source.clock)
         value, sensor = rs.frame_metadata_value, self._sensor
         sensor.set_metadata(value.frame_counter, exposure.number)
-        sensor.set_metadata(value.frame_timestamp, round(1e6 * exposure.stamp_s))
+        sensor.set_metadata(value.frame_timestamp, round(1e6 * exposure.stamp_s))  # librealsense: microseconds
         sensor.set_metadata(value.sensor_timestamp, round(1e6 * exposure.stamp_s))
         arrival_ms = round(1e3 * (self.source.clock.now_s() + offset_s))
         sensor.set_metadata(value.time_of_arrival, arrival_ms)
@@ -188,7 +188,7 @@ class TwinDevice:
         frame.pixels = image
         frame.stride, frame.bpp = size[1] * bytes_per_pixel, bytes_per_pixel
         frame.timestamp = 1e3 * (exposure.stamp_s + unix_offset_s(self.source.clock))
-        frame.domain = rs.timestamp_domain.global_time
+        frame.domain = rs.timestamp_domain.global_time  # the default of a D400
         frame.frame_number = exposure.number
         frame.profile = profile
         if stream == rs.stream.depth:

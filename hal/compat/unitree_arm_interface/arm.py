@@ -28,7 +28,7 @@ _LOG_PERIOD_S = 1.0  # of repeated errors of the loop
 _CARTESIAN_TIMEOUT_S = 0.5  # a script that ends must not leave the arm moving
 _GRIPPER_SPEED = 1.0
 _MAX_ORIENTATION_SPEED, _MAX_POSITION_SPEED = 0.6, 0.3  # [rad/s], [m/s]
-_MAX_LINEAR_SPEED = 1.0
+_MAX_LINEAR_SPEED = 1.0  # [m/s]; above it the vendor's MoveL gets no faster (measured)
 
 
 class ArmInterface:
@@ -79,7 +79,7 @@ class ArmInterface:
             made.connect()
             self._made = made
             self.lowstate.update(made.newest)
-            atexit.register(self._close)
+            atexit.register(self._close)  # the vendor's interface has no call that disconnects
         return self._made
 
     def _close(self) -> None:

@@ -24,7 +24,7 @@ PIVOT_M = float(z1.T_FLANGE_PIVOT[0, 3]) - MOUNT_M
 _MAX_CHANGE_RAD = 0.5
 _SINGULAR_M = 0.1
 _DAMPING = 1e-4  # regularises the least squares at singularities only
-_GRAVITY_JOINT = 6
+_GRAVITY_JOINT = 6  # pinocchio's index of joint6; its joint 0 is the universe
 _END = 6
 
 
