@@ -14,6 +14,7 @@ import numpy as np
 import yaml
 
 from hal.base.errors import ConfigError, InvalidValueError, UsageError
+from hal.base.files import atomic_write
 from hal.base.structure import read_yaml, structure
 from models.obb.mvbb import FitMethod
 from z1_runtime.grasping.features import FEATURES, FORMER_NAMES
@@ -130,9 +131,7 @@ class Scoring:
 def save_scoring(scoring: Scoring, path: Path) -> None:
     """Write `scoring` to `path`, for `load_scoring`; an interrupted write leaves no file there."""
     content = {"format": FORMAT, "version": VERSION, **_plain(asdict(scoring))}
-    partial = path.with_suffix(".partial")
-    partial.write_text(yaml.safe_dump(content, sort_keys=False, allow_unicode=True, width=120), encoding="utf-8")
-    partial.replace(path)
+    atomic_write(path, yaml.safe_dump(content, sort_keys=False, allow_unicode=True, width=120))
 
 
 def load_scoring(path: Path) -> Scoring:
