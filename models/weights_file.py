@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import os
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -11,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from hal.base.errors import InvalidValueError, Z1Error
+from hal.base.files import atomic_path
 
 WEIGHTS_FOLDER = Path(__file__).resolve().parent / "weights"
 
@@ -31,14 +31,10 @@ def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> str:
     """
     if path.suffix != ".npz":
         raise InvalidValueError(f"{path} must end in .npz: weights are kept as NumPy arrays.", code="weights_suffix")
-    # In the same folder, since a rename is atomic only within one file system
-    partial = path.with_name(f".{path.stem}.{os.getpid()}.npz")
-    try:
-        np.savez(partial, allow_pickle=False, **arrays)
+    with atomic_path(path) as partial:
+        with partial.open("wb") as file:
+            np.savez(file, allow_pickle=False, **arrays)
         digest = sha256_of(partial)
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
     path.with_suffix(".sha256").write_text(f"{digest}  {path.name}\n")
     return digest
 

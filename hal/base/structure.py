@@ -16,7 +16,7 @@ from hal.base.errors import ConfigError
 
 T = TypeVar("T")
 
-_EXTRA, _VALUE = "unexpected_keyword_argument", "value_error"
+_EXTRA, _MISSING, _VALUE = "unexpected_keyword_argument", "missing", "value_error"
 
 
 def read_yaml(path: Path, what: str) -> Any:
@@ -47,7 +47,8 @@ def structure(kind: type[T], data: Any, where: str) -> T:
     Types are strict: a text is no number, a whole number is a float but not the other way round.
 
     Raises:
-        ConfigError: `unknown_key`, `wrong_type` or `out_of_range`; the message begins with `where`, `key` is the path.
+        ConfigError: `unknown_key`, `missing_key`, `wrong_type` or `out_of_range`; the message begins with `where`,
+            `key` is the path.
     """
     from pydantic import ValidationError
 
@@ -76,6 +77,8 @@ def _explain(found: Mapping[str, Any], kind: type, where: str) -> ConfigError:
         near = difflib.get_close_matches(path[-1], known, n=1)
         hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(known)}."
         return ConfigError(f"{where} has an unknown key {key!r}; {hint}", code="unknown_key", key=key)
+    if found["type"] == _MISSING and isinstance(found["loc"][-1], str):  # a tuple lacks an index
+        return ConfigError(f"{where} lacks the key {key!r}.", code="missing_key", key=key)
     if found["type"] == _VALUE:
         reason = str(found["ctx"]["error"])
         return ConfigError(f"{where}: {'.'.join((*path, reason))}", code="out_of_range", key=key)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from hal.base.files import atomic_path
 from models.detector.weights import CAMERA_HW, TRAIN_COMMAND, disable_ultralytics_network, load_detector
 from models.torch_threads import single_threaded_workers
 from models.weights_file import WeightsError, sha256_of, verify_sha256
@@ -68,13 +69,8 @@ def export_to_onnx(path: Path, folder: Path | None = None) -> Path:
     digest = verify_sha256(path, TRAIN_COMMAND) if path.suffix == ".npz" else sha256_of(path)
     target = (folder or cache_folder()) / f"{path.stem}-{digest[:16]}-{_EXPORT}.onnx"
     if not target.is_file():
-        partial = target.with_name(f".{target.name}.{os.getpid()}")
-        try:
-            with single_threaded_workers(1, "export") as worker:
-                worker.submit(lambda: _export(load_module(path), partial)).result()
-            partial.replace(target)  # atomic: no reader gets half a file
-        finally:
-            partial.unlink(missing_ok=True)
+        with atomic_path(target) as partial, single_threaded_workers(1, "export") as worker:
+            worker.submit(lambda: _export(load_module(path), partial)).result()
     return target
 
 

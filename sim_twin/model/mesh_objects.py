@@ -15,6 +15,7 @@ from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
 from hal.base.errors import Z1Error
+from hal.base.files import atomic_path
 from sim_twin.model.objects import OBJECT_BODY, add_object
 from sim_twin.model.parts import GraspObject, Part
 from sim_twin.model.z1_mjcf import BIT_SCENE
@@ -153,11 +154,8 @@ def _decompose(mesh: trimesh.Trimesh, content: bytes) -> list[np.ndarray]:
     parts = coacd.run_coacd(coacd.Mesh(mesh.vertices, mesh.faces), **_COACD, **more)
     hulls = [np.asarray(vertices, dtype=np.float64) for vertices, _ in parts]
     path.parent.mkdir(parents=True, exist_ok=True)
-    # Renamed when complete: several processes may decompose the same mesh at once
-    partial = path.with_suffix(f".{os.getpid()}.partial")
-    with partial.open("wb") as file:
+    with atomic_path(path) as partial, partial.open("wb") as file:
         np.savez(file, allow_pickle=False, **{f"hull_{k:02}": hull for k, hull in enumerate(hulls)})
-    partial.replace(path)
     return hulls
 
 

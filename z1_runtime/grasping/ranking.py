@@ -1,19 +1,21 @@
 """Numbers of a ranking: configured, or fitted by `./z1 tune` and read from its file.
 
-The file is YAML of plain numbers; reading it needs nothing but this module, and nothing in it is executed.
+The file is YAML of plain numbers; nothing in it is executed.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
 
-from hal.base.errors import InvalidValueError, UsageError
+from hal.base.errors import ConfigError, InvalidValueError, UsageError
+from hal.base.files import atomic_write
+from hal.base.structure import read_yaml, structure
 from models.obb.mvbb import FitMethod
 from z1_runtime.grasping.features import FEATURES, FORMER_NAMES
 
@@ -38,7 +40,7 @@ class ScoringHead:
     """Success probability of a grasp: logistic regression on standardised features."""
 
     features: tuple[str, ...]
-    """F keys of `FEATURES`."""
+    """F keys of `FEATURES`; a key of `FORMER_NAMES` becomes the present one."""
     mean: tuple[float, ...]
     """(F,) of the grasps it was fitted to."""
     scale: tuple[float, ...]
@@ -48,19 +50,17 @@ class ScoringHead:
     intercept: float
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "features", tuple(FORMER_NAMES.get(name, name) for name in self.features))
         if not self.features or set(self.features) - set(FEATURES):
-            named = ", ".join(self.features) or "no feature"
-            raise InvalidValueError(f"the head uses {named}; known: {', '.join(FEATURES)}. {_REMAKE}")
+            raise InvalidValueError(f"features is {list(self.features)}; known: {', '.join(FEATURES)}.")
         rows = {"mean": self.mean, "scale": self.scale, "coefficients": self.coefficients}
         for name, values in rows.items():
             if len(values) != len(self.features) or not np.isfinite(values).all():
-                raise InvalidValueError(
-                    f"{name} of the head is {values}; it must hold {len(self.features)} finite numbers."
-                )
-        if min(self.scale) <= 0.0 or not np.isfinite(self.intercept):
-            raise InvalidValueError(
-                f"the head needs scale > 0 and a finite intercept; got {self.scale}, {self.intercept}."
-            )
+                raise InvalidValueError(f"{name} is {values}; it must hold {len(self.features)} finite numbers.")
+        if min(self.scale) <= 0.0:
+            raise InvalidValueError(f"scale is {self.scale}; allowed is above 0.")
+        if not np.isfinite(self.intercept):
+            raise InvalidValueError(f"intercept is {self.intercept}; it must be finite.")
 
     def probability(self, measured: np.ndarray) -> np.ndarray:
         """Return the success probability (N,) of each grasp, in (0, 1).
@@ -131,9 +131,7 @@ class Scoring:
 def save_scoring(scoring: Scoring, path: Path) -> None:
     """Write `scoring` to `path`, for `load_scoring`; an interrupted write leaves no file there."""
     content = {"format": FORMAT, "version": VERSION, **_plain(asdict(scoring))}
-    partial = path.with_suffix(".partial")
-    partial.write_text(yaml.safe_dump(content, sort_keys=False, allow_unicode=True, width=120), encoding="utf-8")
-    partial.replace(path)
+    atomic_write(path, yaml.safe_dump(content, sort_keys=False, allow_unicode=True, width=120))
 
 
 def load_scoring(path: Path) -> Scoring:
@@ -142,29 +140,10 @@ def load_scoring(path: Path) -> Scoring:
     Raises:
         ScoringError: the file is missing, of another format or version, or has an unknown key or a wrong value.
     """
-    content = _content(path)
     try:
-        return Scoring(
-            mvb=_ranking(content["mvb"]),
-            full=_ranking(content["full"]),
-            tuned=tuple(content.get("tuned", ())),
-            evidence=content.get("evidence") or {},
-        )
-    except KeyError as error:
-        raise ScoringError(f"the scoring {path} lacks {error}. {_REMAKE}", code="scoring_incomplete") from error
-    except (TypeError, ValueError) as error:
-        raise ScoringError(f"the scoring {path} cannot be used: {error}", code="scoring_value") from error
-
-
-def _content(path: Path) -> Mapping[str, Any]:
-    try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        why = error.strerror if isinstance(error, OSError) else "it is no text"
-        message = f"the scoring {path} cannot be read: {why}. {_HINT}"
-        raise ScoringError(message, code="scoring_unreadable") from error
-    except yaml.YAMLError as error:
-        raise ScoringError(f"the scoring {path} is not YAML: {error}", code="scoring_unreadable") from error
+        content = read_yaml(path, "the scoring")
+    except ConfigError as error:
+        raise ScoringError(f"{error} {_HINT}", code="scoring_unreadable") from error
     if not isinstance(content, Mapping) or content.get("format") != FORMAT:
         message = f"{path} is no scoring file: its first line is not `format: {FORMAT}`. {_HINT}"
         raise ScoringError(message, code="scoring_format")
@@ -173,37 +152,12 @@ def _content(path: Path) -> Mapping[str, Any]:
             f"the scoring {path} is of version {content.get('version')!r}; this program reads {VERSION}. {_REMAKE}",
             code="scoring_version",
         )
-    return content
-
-
-def _ranking(data: Any) -> Ranking:
-    values = _known(data, Ranking)
-    for key, value in values.items():
-        allowed = _TYPES.get(key, (int, float))
-        if key != "head" and (not isinstance(value, allowed) or isinstance(value, bool) != (bool in allowed)):
-            raise InvalidValueError(f"{key} is {value!r}; it must be of type {allowed[-1].__name__}.")
-    if values.get("head") is not None:
-        values["head"] = _head(_known(values["head"], ScoringHead))
-    return Ranking(**values)
-
-
-_TYPES = {"k_faces": (int,), "hard_filter": (bool,), "box_method": (str,)}
-
-
-def _head(values: Mapping[str, Any]) -> ScoringHead:
-    columns = {key: tuple(float(value) for value in values[key]) for key in ("mean", "scale", "coefficients")}
-    features = tuple(FORMER_NAMES.get(str(name), str(name)) for name in values["features"])
-    return ScoringHead(features=features, intercept=float(values["intercept"]), **columns)
-
-
-def _known(data: Any, kind: type) -> dict[str, Any]:
-    """Return `data` as the fields of the dataclass `kind`."""
-    names = [each.name for each in fields(kind)]
-    if not isinstance(data, Mapping):
-        raise InvalidValueError(f"it holds {data!r} instead of {', '.join(names)}.")
-    if unknown := [key for key in data if key not in names]:
-        raise InvalidValueError(f"it has an unknown key {unknown[0]!r}; known: {', '.join(names)}.")
-    return dict(data)
+    values = {key: value for key, value in content.items() if key not in ("format", "version")}
+    try:
+        return structure(Scoring, values, f"the scoring {path}")
+    except ConfigError as error:
+        code = "scoring_incomplete" if error.code == "missing_key" else "scoring_value"
+        raise ScoringError(f"{error} {_REMAKE}", code=code) from error
 
 
 def _plain(value: Any) -> Any:

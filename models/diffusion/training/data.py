@@ -62,7 +62,7 @@ def load_shards(folder: Path, limit: int | None = None) -> GraspData:
     Raises:
         MissingFileError: there are none.
     """
-    paths = sorted(p for p in folder.glob("*.npz") if not p.name.endswith(".partial.npz"))[:limit]
+    paths = sorted(folder.glob("*.npz"))[:limit]
     if not paths:
         raise MissingFileError(f"No shards in {folder}; run `python -m scripts.train.make_grasp_dataset` first.")
     shards = [np.load(path, allow_pickle=False) for path in paths]

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from hal.base.files import atomic_path
 from models.diffusion.network import N_COORDINATES, Denoiser, decode_grasps, encode_grasps
 from models.diffusion.training.data import GraspData
 from models.diffusion.training.dynamics_test import simulate_grasps
@@ -78,10 +79,8 @@ def label_samples(
         chunk = _load(path, digest)
         if chunk is None:
             chunk = _label_chunk(generator, data, gripper, views[start : start + _CHUNK], config, (seed, 2, start))
-            partial = path.with_suffix(".partial.npz")
-            np.savez(partial, allow_pickle=False, digest=np.array(digest), **chunk)
-            # Atomic: an interrupted run leaves no half chunk to be reused
-            partial.replace(path)
+            with atomic_path(path) as partial, partial.open("wb") as file:
+                np.savez(file, allow_pickle=False, digest=np.array(digest), **chunk)
         chunks.append(chunk)
         progress(start + len(chunk["valid"]), float(chunk["valid"].mean()))
     joined = {key: np.concatenate([chunk[key] for chunk in chunks]) for key in chunks[0]}

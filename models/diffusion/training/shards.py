@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from hal.base.files import atomic_path
 from models.diffusion.cloud import prepare_cloud
 from models.diffusion.training.dynamics_test import simulate_grasps
 from models.diffusion.training.grippers import AnyGripper, ParallelGripperSpec
@@ -79,9 +80,8 @@ def _pad_parts(rows: np.ndarray) -> np.ndarray:
 
 def save_shard(path: Path, arrays: dict[str, np.ndarray]) -> None:
     """Write a shard to `path` atomically."""
-    partial = path.with_suffix(".partial.npz")
-    np.savez(partial, allow_pickle=False, **arrays)
-    partial.rename(path)
+    with atomic_path(path) as partial, partial.open("wb") as file:
+        np.savez(file, allow_pickle=False, **arrays)
 
 
 def simulate_shard(arrays: dict[str, np.ndarray], gripper: ParallelGripperSpec, count: int) -> dict:

@@ -14,6 +14,7 @@ from scipy.optimize import minimize
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from hal.base.files import atomic_path
 from models.diffusion.network import Denoiser, Discriminator, encode_grasps
 from models.diffusion.training.data import GraspData, augment
 from models.diffusion.training.labelled_samples import LabelledSamples, LabellingConfig, ProgressCallback
@@ -204,8 +205,6 @@ def _follow(average: nn.Module, model: nn.Module, keep: float) -> None:
 
 
 def _save(path: Path, model: nn.Module, average: nn.Module, optimiser: torch.optim.Optimizer, iteration: int) -> None:
-    partial = path.with_suffix(".partial")
     state = {"model": model.state_dict(), "average": average.state_dict(), "optimiser": optimiser.state_dict()}
-    torch.save(state | {"iteration": iteration}, partial)
-    # Atomic: an interrupted write leaves the last checkpoint whole
-    partial.replace(path)
+    with atomic_path(path) as partial, partial.open("wb") as file:
+        torch.save(state | {"iteration": iteration}, file)

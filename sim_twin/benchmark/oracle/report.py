@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from hal.base.files import atomic_write
 from sim_twin.benchmark.episodes.rows import Row
 from sim_twin.benchmark.episodes.scenarios import DISTANCES_M, LATERALS_M
 from sim_twin.benchmark.report.page import write_page
@@ -60,9 +61,7 @@ def write_summary(
 ) -> dict[str, Any]:
     """Write summary.json at `path`, with the settings `run`, and return its content."""
     content = {"run": dict(run), **summarise(rows, others)}
-    partial = path.with_suffix(".partial")
-    partial.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n")
-    partial.replace(path)
+    atomic_write(path, json.dumps(content, indent=1, ensure_ascii=False) + "\n")
     return content
 
 

@@ -7,14 +7,14 @@ from pathlib import Path
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
+from hal.base.files import atomic_write
+
 _TEMPLATES = Path(__file__).parent / "templates"
 
 
 def write_page(path: Path, template: str, **context: object) -> None:
     """Render `template` with `context` to `path`, which is replaced once the page is complete."""
-    partial = path.with_suffix(".partial")
-    partial.write_text(_environment().get_template(template).render(context), encoding="utf-8")
-    partial.replace(path)
+    atomic_write(path, _environment().get_template(template).render(context))
 
 
 @cache

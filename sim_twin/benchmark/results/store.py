@@ -16,6 +16,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from hal.base.errors import OutputExistsError
+from hal.base.files import PARTIAL, atomic_path
 from sim_twin.benchmark.episodes.rows import TRACEBACK, Row
 
 FOLDER, TABLE, ERROR_LOG = "episodes", "episodes.parquet", "errors.log"
@@ -38,8 +39,7 @@ class Store:
                 f"store: {out} has the episodes of an earlier run. Add --resume to continue it, or give another --out."
             )
         self._folder.mkdir(parents=True, exist_ok=True)
-        # Left by a run that was killed
-        for partial in self._folder.glob("*.partial"):
+        for partial in self._folder.glob(f"*{PARTIAL}"):
             partial.unlink()
 
     def done(self) -> set[tuple[str, str]]:
@@ -58,12 +58,10 @@ class Store:
         if len(methods) > _LONGEST_NAME or "/" in methods:  # many variants, or one with the path of its scoring
             methods = hashlib.sha256(methods.encode()).hexdigest()[:16]
         path = self._folder / f"{rows[0]['scenario']}-{methods}.parquet"
-        partial = path.with_suffix(".partial")
-        pq.write_table(pa.Table.from_pylist(_align_columns(rows)), partial)
-        # On the disk before it has its name: a crash leaves no incomplete file under it
-        with partial.open("rb") as file:
-            os.fsync(file.fileno())
-        partial.replace(path)
+        with atomic_path(path) as partial:
+            pq.write_table(pa.Table.from_pylist(_align_columns(rows)), partial)
+            with partial.open("rb") as file:
+                os.fsync(file.fileno())
 
     def _log_errors(self, rows: Iterable[Row]) -> None:
         entries = [f"{row['scenario']}, {row['method']}\n{row[TRACEBACK]}\n" for row in rows if TRACEBACK in row]
@@ -88,9 +86,8 @@ class Store:
 
     def write_table(self) -> Path:
         """Write all rows as one file next to the folder and return its path."""
-        partial = self._table.with_suffix(".partial")
-        pq.write_table(pa.Table.from_pylist(_align_columns(self.rows())), partial)
-        partial.replace(self._table)
+        with atomic_path(self._table) as partial:
+            pq.write_table(pa.Table.from_pylist(_align_columns(self.rows())), partial)
         return self._table
 
 

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from hal.base.files import atomic_write
 from sim_twin.benchmark.episodes.execution import Mode
 from sim_twin.benchmark.episodes.rows import Row
 from sim_twin.benchmark.results.stats import mcnemar, paired_difference, wilson
@@ -58,10 +59,7 @@ def summarise_method(rows: Sequence[Row]) -> dict[str, Any]:
 def write_summary(rows: Sequence[Row], path: Path, run: dict[str, Any]) -> dict[str, Any]:
     """Write summary.json at `path`, with the settings `run`, and return its content."""
     content = {"run": run, **summarise(rows)}
-    partial = path.with_suffix(".partial")
-    partial.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n")
-    # Replaced at once, so that no reader gets half of a file
-    partial.replace(path)
+    atomic_write(path, json.dumps(content, indent=1, ensure_ascii=False) + "\n")
     return content
 
 

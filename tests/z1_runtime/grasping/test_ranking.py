@@ -83,6 +83,7 @@ def test_the_runtime_ranks_by_its_configuration_or_by_the_file_it_names(file: Pa
         ({"version": 2}, "scoring_version"),
         ({"format": "poem"}, "scoring_format"),
         ({"mvb": None}, "scoring_value"),
+        ({"tunde": []}, "scoring_value"),
         ({"tuned": ["best"]}, "scoring_value"),
         ({"full": {"k": 3}}, "scoring_value"),
         ({"full": {"k_faces": 9}}, "scoring_value"),
@@ -113,6 +114,7 @@ def test_a_wrong_scoring_is_rejected_with_its_name(file: Path, change: dict, cod
         {"scale": None},
         {"coefficients": [1.0, float("inf")]},
         {"scale": [0.0, 1.0]},
+        {"intercept": float("nan")},
         {"pickle": "…"},
     ],
 )
@@ -139,6 +141,11 @@ def test_a_missing_file_and_a_missing_part_are_rejected_with_the_remedy(tmp_path
     assert "nowhere.yaml" in str(caught.value)
     assert "./z1 tune" in str(caught.value)
     content = yaml.safe_load(file.read_text())
+    del content["full"]["head"]["intercept"]
+    file.write_text(yaml.safe_dump(content))
+    with raises(ScoringError, "scoring_incomplete") as caught:
+        load_scoring(file)
+    assert "full.head" in str(caught.value)
     del content["full"]
     file.write_text(yaml.safe_dump(content))
     with raises(ScoringError, "scoring_incomplete"):

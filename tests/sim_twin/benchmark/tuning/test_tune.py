@@ -10,6 +10,7 @@ from sim_twin.benchmark.tuning.logged_episodes import TuneError, load_logs
 from sim_twin.benchmark.tuning.report import write_tuning_report
 from tests.support.errors import raises
 from tests.support.tune_episodes import episode, number_of, scenarios, write_run
+from z1_runtime.grasping.features import FEATURES
 from z1_runtime.grasping.ranking import load_scoring, save_scoring
 
 pytest.importorskip("sklearn", reason="uv sync --inexact --extra tune")
@@ -148,7 +149,7 @@ def test_a_head_is_proposed_as_a_file_and_taken_when_its_episodes_win(fitted, tm
     page = (tmp_path / "report.html").read_text()
     assert "took k=2 α=0.85 box=pca + head" in page
     assert page.count("<svg") == 3
-    assert "how far the approach points down" in page
+    assert FEATURES["down"] in page
 
 
 def test_the_limit_is_shared_among_the_proposals(fitted):
