@@ -85,12 +85,12 @@ def unreachable_pose() -> np.ndarray:
 @pytest.mark.parametrize(
     ("goal", "kind", "code"),
     [
-        (np.full(6, 9.0), InvalidValueError, "invalid_value"),
-        (np.append(z1.Q_HOME, 0.5), InvalidValueError, "invalid_value"),
-        (np.full(6, np.nan), InvalidValueError, "invalid_value"),
+        (np.full(6, 9.0), InvalidValueError, "joint_limit"),
+        (np.append(z1.Q_HOME, 0.5), InvalidValueError, "joint_limit"),
+        (np.full(6, np.nan), InvalidValueError, "joint_limit"),
         (np.zeros(3), InvalidValueError, "invalid_value"),
-        (unreachable_pose(), IkFailure, "ik"),
-        (np.array([0.0, 2.9, -0.05, 0.0, 0.0, 0.0]), GuardError, "guard"),
+        (unreachable_pose(), IkFailure, "unreachable"),
+        (np.array([0.0, 2.9, -0.05, 0.0, 0.0, 0.0]), GuardError, "table"),
     ],
     ids=["beyond the limits", "jaw beyond its limit", "not finite", "shape", "out of reach", "into the table"],
 )
