@@ -140,4 +140,4 @@ def test_stop_without_a_hal_process_is_one_clear_error(capsys: pytest.CaptureFix
 
 def test_bad_option_value_of_ours_is_bad_usage(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["stop", "--robot", "no spaces"]) == 2
-    assert "allowed are" in capsys.readouterr().err
+    assert "allowed 1 to 40 letters" in capsys.readouterr().err

@@ -32,7 +32,7 @@ def test_an_unknown_generator_is_rejected_with_the_known_ones(tmp_path):
     assert "antipodal, obb_sweep, diffusion" in str(unknown.value)
     path = tmp_path / "config.yaml"
     path.write_text("generator: oracle\n")
-    with raises(ConfigError, "invalid_config"):
+    with raises(ConfigError, "out_of_range"):
         load_config(path)
 
 

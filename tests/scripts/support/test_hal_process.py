@@ -33,7 +33,7 @@ def test_scene_options_have_the_scene_s_defaults_and_reach_it() -> None:
 
 
 def test_scene_option_out_of_range_is_an_error_of_the_user() -> None:
-    with raises(InvalidValueError, "invalid_value") as caught:
+    with raises(InvalidValueError, "scene_range") as caught:
         SceneOptions(distance_m=2.0).to_scene()
     assert "2.0" in str(caught.value) and "0.3 to 0.65" in str(caught.value)
 

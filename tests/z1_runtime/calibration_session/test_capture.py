@@ -122,7 +122,7 @@ def test_a_guided_arm_is_sampled_when_it_holds_a_new_view_still(robot: Calibrati
     move(robot, views[0])
     past_the_board = np.append(z1.Q_HOME, 0.0)
     past_the_board[0] = 1.2
-    taken = list(capture.capture_hand_guided(Operator(robot, [past_the_board, views[1]], {}), wanted=2))
+    taken = list(capture.capture_hand_guided(Operator(robot, [past_the_board, views[1]], {}), n_samples=2))
     assert [one.name for one in taken] == ["0001", "", "0002"]  # a view without the board is tried once
     for q, sample in zip(views, load_samples(tmp_path).samples, strict=True):
         assert np.abs(sample.q - q).max() < 5e-3
@@ -133,7 +133,7 @@ def test_operator_captures_and_ends_and_nothing_moves_the_arm(robot: Calibration
     capture.open("2026-01-01T00:00:00+00:00")
     operator = Operator(robot, [], {3: "take", 7: "take", 9: "end"})
     before = robot.arm.status().trajectory_id
-    taken = list(capture.capture_hand_guided(operator, wanted=20, automatic=False))
+    taken = list(capture.capture_hand_guided(operator, n_samples=20, automatic=False))
     assert [one.name for one in taken] == ["0001", "0002"]
     assert robot.arm.status().trajectory_id == before
 

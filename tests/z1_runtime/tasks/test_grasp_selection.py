@@ -49,6 +49,9 @@ class Corrupted:
     def __init__(self, perception, corrupt):
         self._perception, self._corrupt = perception, corrupt
 
+    def filter_self(self, *args):
+        return self._perception.filter_self(*args)
+
     def detect(self, *args):
         return self._perception.detect(*args)
 
@@ -124,10 +127,10 @@ def test_an_empty_table_raises_no_detection(selector, T_base_camera):
 
 
 def test_a_detector_that_needs_the_twin_fails_without_it(selector, T_base_camera):
-    truth_only = make_grasp_selector(replace(CONFIG, detector="truth"))
-    assert isinstance(truth_only.perception._detector, GroundTruthDetector)
+    ground_truth_only = make_grasp_selector(replace(CONFIG, detector="ground_truth"))
+    assert isinstance(ground_truth_only.perception._detector, GroundTruthDetector)
     with pytest.raises(PerceptionError):
-        truth_only.select(replace(draw_can(T_base_camera), ground_truth_mask=None), Q)
+        ground_truth_only.select(replace(draw_can(T_base_camera), ground_truth_mask=None), Q)
 
 
 def nan_in_the_middle(points: np.ndarray) -> np.ndarray:
@@ -172,7 +175,7 @@ def test_candidates_that_all_come_from_behind_leave_no_plan(selector, selection,
     assert "none of 300 candidates approaches one of the 2 nearest faces" in str(caught.value)
 
 
-@pytest.mark.parametrize("detector", ["yolo", "tabletop", "truth"])
+@pytest.mark.parametrize("detector", ["yolo", "tabletop", "ground_truth"])
 def test_warming_up_needs_no_camera_with_any_detector(detector, caplog):
     with caplog.at_level("INFO", "z1_runtime.tasks.warm_up"):
         warm_up_selector(make_grasp_selector(replace(RuntimeConfig(), detector=detector)))
@@ -180,9 +183,9 @@ def test_warming_up_needs_no_camera_with_any_detector(detector, caplog):
 
 
 def test_warming_up_reads_the_jaws_meshes_though_no_jaws_are_drawn(selector):
-    extrinsics_check._sampled.cache_clear()
+    extrinsics_check._sample_mesh.cache_clear()
     warm_up_selector(selector)
-    assert extrinsics_check._sampled.cache_info().currsize == 2
+    assert extrinsics_check._sample_mesh.cache_info().currsize == 2
 
 
 def test_a_warm_up_scene_without_a_plan_is_logged_and_a_real_one_is_an_error(T_base_camera, caplog):

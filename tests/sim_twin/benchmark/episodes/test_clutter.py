@@ -46,8 +46,8 @@ def test_neighbours_stand_apart_from_the_object_and_from_each_other_and_not_befo
 def test_the_same_scenario_has_the_same_neighbours_and_the_row_names_them():
     assert CLUTTERED.scene() == CLUTTERED.scene()
     assert len({s.scene().neighbours for s in grid(clutters=(2,))}) == 81
-    assert CLUTTERED.features()["neighbours"] == [n.object for n in CLUTTERED.scene().neighbours]
-    assert Scenario.from_row(CLUTTERED.features()) == CLUTTERED
+    assert CLUTTERED.columns()["neighbours"] == [n.object for n in CLUTTERED.scene().neighbours]
+    assert Scenario.from_row(CLUTTERED.columns()) == CLUTTERED
 
 
 def test_the_extended_sets_neighbours_are_of_that_set():

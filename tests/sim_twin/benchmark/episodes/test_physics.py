@@ -31,7 +31,7 @@ def test_what_is_drawn_fills_its_range():
 
 
 def test_the_world_is_as_drawn_and_the_row_says_so():
-    scene, row = NOISY.scene(), NOISY.features()
+    scene, row = NOISY.scene(), NOISY.columns()
     usual = World(SceneConfig(object="box", lateral_m=0.15)).model
     model = World(scene).model
     factor = row["mass_factor"]

@@ -29,7 +29,7 @@ def entities(path):
 
 def test_a_failure_is_recorded_with_what_was_seen_and_ranked(decider, tmp_path, monkeypatch):
     at_the_lens = GraspSet(T_camera_grasps=np.tile(np.eye(4), (3, 1, 1)), scores=np.ones(3), widths_m=np.full(3, 0.04))
-    monkeypatch.setattr(type(decider), "propose", lambda self, observation: at_the_lens)
+    monkeypatch.setattr(type(decider), "generate", lambda self, observation: at_the_lens)
     recordings = Recordings(folder=tmp_path / "recordings", choice="failures")
     (row,) = run_scenario(SCENARIO, METHODS, lambda *_: decider, recordings=recordings)
     assert not row["success"]
