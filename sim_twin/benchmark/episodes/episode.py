@@ -47,9 +47,9 @@ def run_scenario(
         top_k: candidates that may be executed; after a failure the scene as it then is is captured again.
         recordings: the episodes to record for Rerun too.
     """
-    decider = make_grasp_selector(scenario, scenario.draw_seed)  # settings that cannot be used end the run here
+    selector = make_grasp_selector(scenario, scenario.draw_seed)  # settings that cannot be used end the run here
     try:
-        shared = _observe_first(scenario, decider)
+        shared = _observe_first(scenario, selector)
     except Exception as error:  # one scenario's defect must not cost the run the others
         return [make_error_row(scenario, method.name, error, top_k=top_k) for method in methods]
     rows = []
@@ -72,11 +72,11 @@ def record_scenario(scenario: Scenario, method: Method, make_grasp_selector: Mak
     Returns:
         The file, or None where nothing is detected.
     """
-    decider = make_grasp_selector(scenario, scenario.draw_seed)
-    shared = _observe_first(scenario, decider)
+    selector = make_grasp_selector(scenario, scenario.draw_seed)
+    shared = _observe_first(scenario, selector)
     if isinstance(shared, Attempt):
         return None
-    return record(folder / recording_name(scenario, method), _decide(method, decider, shared))
+    return record(folder / recording_name(scenario, method), _decide(method, selector, shared))
 
 
 def recording_name(scenario: Scenario, method: Method) -> str:
@@ -84,18 +84,18 @@ def recording_name(scenario: Scenario, method: Method) -> str:
     return f"{scenario.key}-{file_name(method.name)}.rrd"
 
 
-def _observe_first(scenario: Scenario, decider: GraspSelector) -> SharedObservation | Attempt:
+def _observe_first(scenario: Scenario, selector: GraspSelector) -> SharedObservation | Attempt:
     """Return the observation from home, or the attempt that ended with it."""
     frame, q = capture(scenario.scene())
-    return _observe(scenario, decider, frame, q)
+    return _observe(scenario, selector, frame, q)
 
 
 def _observe(
-    scenario: Scenario, decider: GraspSelector, frame: RgbdFrame, q: np.ndarray
+    scenario: Scenario, selector: GraspSelector, frame: RgbdFrame, q: np.ndarray
 ) -> SharedObservation | Attempt:
     times = StageTimes()
     try:
-        return SharedObservation.by(decider, occlude(frame, scenario.occlusion, scenario.draw_seed), q, times)
+        return SharedObservation.by(selector, occlude(frame, scenario.occlusion, scenario.draw_seed), q, times)
     except PerceptionError as error:
         return Attempt(outcome=Outcome(mode=Mode.NO_DETECTION, detail=str(error)), times=times)
     except ValueError as error:
@@ -113,11 +113,11 @@ def _run_method(
     top_k: int,
     recordings: Recordings | None,
 ) -> Row:
-    decider = make_grasp_selector(scenario, scenario.draw_seed)
-    first = _decide(method, decider, shared)
+    selector = make_grasp_selector(scenario, scenario.draw_seed)
+    first = _decide(method, selector, shared)
     attempts, given_up, qpos = [first], "", None
     if first.plan is not None:
-        with EpisodeRobot(scenario.scene(), decider.kinematics, decider.config.speed) as robot:
+        with EpisodeRobot(scenario.scene(), selector.kinematics, selector.config.speed) as robot:
             attempts, given_up = _execute_attempts(scenario, method, make_grasp_selector, robot, first, top_k=top_k)
             qpos = robot.world.data.qpos.copy()
     row = make_row(scenario, method.name, attempts, top_k=top_k, given_up=given_up, qpos=qpos)
@@ -145,27 +145,27 @@ def _execute_attempts(
         if outcome.mode not in RETRIED or len(attempts) == top_k:
             return attempts, ""
         # Another seed: a retry is to have other candidates
-        decider = make_grasp_selector(scenario, scenario.draw_seed + len(attempts))
+        selector = make_grasp_selector(scenario, scenario.draw_seed + len(attempts))
         try:
-            robot.withdraw(attempt.plan, outcome, decider.config.jaw_home)
+            robot.withdraw(attempt.plan, outcome, selector.config.jaw_home)
             if len(attempts) == 1:
                 robot.capture()  # this robot's first frame would have the noise of the episode's first frame
-            found = _observe(scenario, decider, *robot.capture())
+            found = _observe(scenario, selector, *robot.capture())
         except (MotionError, HalError) as error:
             return attempts, f"{Mode.STOPPED.value}: {error}"
-        attempt = found if isinstance(found, Attempt) else _decide(method, decider, found)
+        attempt = found if isinstance(found, Attempt) else _decide(method, selector, found)
         if attempt.plan is None:
             return attempts, f"{attempt.ended.mode.value}: {attempt.ended.detail}"
 
 
-def _decide(method: Method, decider: GraspSelector, shared: SharedObservation) -> Attempt:
+def _decide(method: Method, selector: GraspSelector, shared: SharedObservation) -> Attempt:
     """Return the attempt of `method`; without a plan where there is none."""
     times = StageTimes()
     times.ms |= shared.times.ms
     best_first = left = None
     try:
-        best_first, left = method.order(shared, decider, times)
-        plan = decider.planner.plan(best_first.candidates, shared.q, times.stage)
+        best_first, left = method.order(shared, selector, times)
+        plan = selector.planner.plan(best_first.candidates, shared.q, times.stage)
     except (DegenerateCloudError, NoPlanError) as error:
         rejections = error.rejections if isinstance(error, NoPlanError) else ()
         outcome = Outcome(mode=_why_no_plan(rejections), detail=str(error))

@@ -57,7 +57,7 @@ class Method:
         return replace(configured, **{name: value for name, value in own.items() if value is not None})
 
     def order(
-        self, shared: SharedObservation, decider: GraspSelector, times: StageTimes
+        self, shared: SharedObservation, selector: GraspSelector, times: StageTimes
     ) -> tuple[RankedCandidates, np.ndarray]:
         """Return the candidates in the order to try them, and which (M,) were left before the ranking.
 
@@ -65,7 +65,7 @@ class Method:
 
         Args:
             shared: the observation, with its candidates.
-            decider: whose kinematics, gripper and box settings are used.
+            selector: whose kinematics, gripper and box settings are used.
             times: gets the stages `collision` (the scene), `filter` (of collisions) and `rank` (fit, filter by the
                 box, score).
 
@@ -73,20 +73,20 @@ class Method:
             DegenerateCloudError: the object's cloud spans no box.
             NoPlanError: `full` keeps none.
         """
-        scene = shared.scene(decider, times)
+        scene = shared.scene(selector, times)
         if self.rank_by == "full":
-            ranking = self.ranking(decider.ranking)
+            ranking = self.ranking(selector.ranking)
             with times.stage("rank"):
-                filtered = decider.filter(shared.candidates, shared.observation, ranking)
-                return decider.rank(filtered, scene, ranking), np.arange(len(shared.candidates))
-        fitted = shared.fitted(decider, times) if self.collision_filter else None
+                filtered = selector.filter(shared.candidates, shared.observation, ranking)
+                return selector.rank(filtered, scene, ranking), np.arange(len(shared.candidates))
+        fitted = shared.fitted(selector, times) if self.collision_filter else None
         left = np.arange(len(shared.candidates)) if fitted is None else np.flatnonzero(fitted.free())
         with times.stage("rank"):
             ranked, ranking = self._rank_left(shared, left)
             if fitted is not None:
                 candidates = fitted.reordered(left[ranked.indices])
             else:
-                candidates = decider.fit_candidates(ranked.grasps, scene, chunk=EARLY_EXIT_CHUNK)
+                candidates = selector.fit_candidates(ranked.grasps, scene, chunk=EARLY_EXIT_CHUNK)
             if ranking is None:
                 return RankedCandidates(ranked=ranked, candidates=candidates), left
             return _order_by(ranking, RankedCandidates(ranked=ranked, candidates=candidates)), left

@@ -67,10 +67,10 @@ def run_task(task: Task) -> list[Row]:
         logging.ERROR
     )  # warnings of wrong extrinsics are expected here: the benchmark varies them
 
-    def decider(scenario: Scenario, seed: int) -> GraspSelector:
+    def selector(scenario: Scenario, seed: int) -> GraspSelector:
         return make_grasp_selector(task.config, scenario, seed)
 
-    return run_scenario(task.scenario, task.methods, decider, top_k=task.top_k, recordings=task.recordings)
+    return run_scenario(task.scenario, task.methods, selector, top_k=task.top_k, recordings=task.recordings)
 
 
 def run_tasks(tasks: Sequence[T], jobs: int, run: Callable[[T], list[Row]] = run_task) -> Iterator[list[Row]]:
@@ -154,6 +154,6 @@ def _assembled(config: RuntimeConfig) -> GraspSelector:
     from z1_runtime.factory import make_grasp_selector
     from z1_runtime.tasks.warm_up import warm_up_selector
 
-    decider = make_grasp_selector(config)
-    warm_up_selector(decider)
-    return decider
+    selector = make_grasp_selector(config)
+    warm_up_selector(selector)
+    return selector

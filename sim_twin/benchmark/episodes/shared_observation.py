@@ -35,35 +35,35 @@ class SharedObservation:
         self._filter_times = StageTimes()
 
     @classmethod
-    def by(cls, decider: GraspSelector, frame: RgbdFrame, q: np.ndarray, times: StageTimes) -> SharedObservation:
-        """Return observation and candidates of `decider` for `frame`, taken at joints `q` (7,); `times` gets the time.
+    def by(cls, selector: GraspSelector, frame: RgbdFrame, q: np.ndarray, times: StageTimes) -> SharedObservation:
+        """Return observation and candidates of `selector` for `frame`, taken at joints `q` (7,); `times` gets the time.
 
         Raises:
             PerceptionError: nothing usable was detected.
             ValueError: the generator cannot use the cloud.
         """
-        observation = decider.observe(frame, q, times)
+        observation = selector.observe(frame, q, times)
         with times.stage("generate"):
-            candidates = decider.generate(observation)
+            candidates = selector.generate(observation)
         return cls(frame, q, observation, candidates, times)
 
-    def scene(self, decider: GraspSelector, times: StageTimes) -> PlanningScene:
+    def scene(self, selector: GraspSelector, times: StageTimes) -> PlanningScene:
         """Return the planning scene, built for the first method that needs it; `times` of each gets its `collision`."""
         if self._scene is None:
             with self._scene_times.stage("collision"):
-                self._scene = decider.build_scene(self.observation, self.q)
+                self._scene = selector.build_scene(self.observation, self.q)
         times.ms |= self._scene_times.ms
         return self._scene
 
-    def fitted(self, decider: GraspSelector, times: StageTimes) -> GraspCandidates:
+    def fitted(self, selector: GraspSelector, times: StageTimes) -> GraspCandidates:
         """Return all candidates fitted to the gripper, for the first method that needs them.
 
         `times` of each method gets the stage `filter`.
         """
-        scene = self.scene(decider, times)
+        scene = self.scene(selector, times)
         if self._fitted is None:
             with self._filter_times.stage("filter"):
-                self._fitted = decider.fit_candidates(self.candidates, scene)
+                self._fitted = selector.fit_candidates(self.candidates, scene)
                 self._fitted.free()
         times.ms |= self._filter_times.ms
         return self._fitted

@@ -80,11 +80,11 @@ def test_a_card_in_front_of_the_jaws_is_not_mistaken_for_them(straight: tuple[Rg
 def test_perception_uses_the_corrected_extrinsics_and_warns_once(caplog: pytest.LogCaptureFixture) -> None:
     scene = SceneConfig(object="bottle", mount_error_m=0.003, mount_error_deg=1.0, mount_seed=3)
     frame, jaw, T_true = taken(scene)
-    decider = make_grasp_selector(RuntimeConfig(detector="tabletop", generator="antipodal"))
+    selector = make_grasp_selector(RuntimeConfig(detector="tabletop", generator="antipodal"))
     q = np.append(z1.Q_HOME, jaw)
     with caplog.at_level("WARNING", "z1_runtime.perception.segmentation"):
-        seen = [decider.observe(frame, q) for _ in range(2)]
-    T_base_flange = decider.kinematics.flange(z1.Q_HOME)
+        seen = [selector.observe(frame, q) for _ in range(2)]
+    T_base_flange = selector.kinematics.flange(z1.Q_HOME)
     assert offset_m(z1.T_FLANGE_CAMERA, T_true) > 0.004
     for observation in seen:
         assert offset_m(inverse(T_base_flange) @ observation.T_base_camera, T_true) < 0.0025

@@ -18,13 +18,13 @@ SCENARIO = Scenario(object="cylinder", distance="mid", lateral="centre", pitch_d
 
 
 @pytest.fixture(scope="module")
-def decider():
+def selector():
     return make_grasp_selector(CONFIG)
 
 
 @pytest.fixture(scope="module")
-def rows(decider):
-    return run_scenario(SCENARIO, list(METHODS.values()), lambda *_: decider)
+def rows(selector):
+    return run_scenario(SCENARIO, list(METHODS.values()), lambda *_: selector)
 
 
 def test_every_method_has_a_row_from_the_same_candidates(rows):
@@ -50,7 +50,7 @@ def test_a_row_says_which_candidate_was_taken_and_why(rows):
     assert mvb["success_top1"] == (mvb["success"] and mvb["rank"] == 0)
 
 
-def test_a_row_holds_what_a_scoring_head_is_fitted_to(rows, decider):
+def test_a_row_holds_what_a_scoring_head_is_fitted_to(rows, selector):
     for row in rows:
         grasp, first = ([row[f"{which}_{name}"] for name in FEATURES] for which in ("grasp", "first"))
         assert np.isfinite(grasp).all()
@@ -60,19 +60,19 @@ def test_a_row_holds_what_a_scoring_head_is_fitted_to(rows, decider):
     assert rows[1]["first_candidate"] == rows[1]["candidate"] or rows[1]["rank"] > 0
 
 
-def test_an_object_that_is_not_where_it_was_seen_is_not_called_lifted(decider):
+def test_an_object_that_is_not_where_it_was_seen_is_not_called_lifted(selector):
     frame, q = capture(SCENARIO.scene())
-    plan = decider.select(frame, q).plan
+    plan = selector.select(frame, q).plan
     elsewhere = SceneConfig(object="cylinder", distance_m=0.60, lateral_m=0.20)
-    with EpisodeRobot(elsewhere, decider.kinematics) as robot:
+    with EpisodeRobot(elsewhere, selector.kinematics) as robot:
         outcome = robot.execute(plan)
     assert outcome.mode is Mode.MISSED
     assert outcome.lifted_m < 0.01
 
 
-def test_an_object_that_cannot_be_seen_is_a_row_too(decider):
+def test_an_object_that_cannot_be_seen_is_a_row_too(selector):
     hidden = replace(SCENARIO, occlusion=0.99)
-    (row,) = run_scenario(hidden, [METHODS["mvb"]], lambda *_: decider)
+    (row,) = run_scenario(hidden, [METHODS["mvb"]], lambda *_: selector)
     assert row["mode"] == "no detection"
     assert row["detail"]
     assert not row["success"]

@@ -19,30 +19,30 @@ SCENARIOS = [
 
 
 @pytest.fixture(scope="module")
-def decider():
+def selector():
     return make_grasp_selector(CONFIG)
 
 
-def test_an_exception_becomes_the_row_of_its_method_alone(decider, monkeypatch):
+def test_an_exception_becomes_the_row_of_its_method_alone(selector, monkeypatch):
     def run_method(_, method, *__, **___):
         if method.name == "mvb":
             raise InjectedError("no plan")
         return {"method": method.name}
 
     monkeypatch.setattr(episode, "_run_method", run_method)
-    vanilla, mvb = run_scenario(SCENARIOS[0], [METHODS["vanilla"], METHODS["mvb"]], lambda *_: decider, top_k=2)
+    vanilla, mvb = run_scenario(SCENARIOS[0], [METHODS["vanilla"], METHODS["mvb"]], lambda *_: selector, top_k=2)
     assert vanilla == {"method": "vanilla"}
     assert (mvb["mode"], mvb["success"], mvb["success_after"]) == ("error", False, [False, False])
     assert (mvb["error_type"], mvb["detail"]) == ("InjectedError", "no plan")
     assert "in run_method" in mvb[TRACEBACK]
 
 
-def test_an_exception_before_the_methods_becomes_the_row_of_each(decider, monkeypatch):
+def test_an_exception_before_the_methods_becomes_the_row_of_each(selector, monkeypatch):
     def capture(_):
         raise InjectedError("no frame")
 
     monkeypatch.setattr(episode, "capture", capture)
-    rows = run_scenario(SCENARIOS[0], list(METHODS.values()), lambda *_: decider)
+    rows = run_scenario(SCENARIOS[0], list(METHODS.values()), lambda *_: selector)
     assert [(row["method"], row["mode"], row["error_type"]) for row in rows] == [
         (name, "error", "InjectedError") for name in METHODS
     ]

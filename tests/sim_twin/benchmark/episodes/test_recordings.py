@@ -19,7 +19,7 @@ METHODS = [parse_method("vanilla:collision_filter=no")]
 
 
 @pytest.fixture(scope="module")
-def decider():
+def selector():
     return make_grasp_selector(RuntimeConfig(generator="antipodal", detector="tabletop", n_candidates=400))
 
 
@@ -27,11 +27,11 @@ def entities(path):
     return {chunk.entity_path.strip("/") for chunk in RrdReader(path).stream().to_chunks()}
 
 
-def test_a_failure_is_recorded_with_what_was_seen_and_ranked(decider, tmp_path, monkeypatch):
+def test_a_failure_is_recorded_with_what_was_seen_and_ranked(selector, tmp_path, monkeypatch):
     at_the_lens = GraspSet(T_camera_grasps=np.tile(np.eye(4), (3, 1, 1)), scores=np.ones(3), widths_m=np.full(3, 0.04))
-    monkeypatch.setattr(type(decider), "generate", lambda self, observation: at_the_lens)
+    monkeypatch.setattr(type(selector), "generate", lambda self, observation: at_the_lens)
     recordings = Recordings(folder=tmp_path / "recordings", choice="failures")
-    (row,) = run_scenario(SCENARIO, METHODS, lambda *_: decider, recordings=recordings)
+    (row,) = run_scenario(SCENARIO, METHODS, lambda *_: selector, recordings=recordings)
     assert not row["success"]
     (path,) = (tmp_path / "recordings").iterdir()
     assert path.name == f"{SCENARIO.key}-vanilla_collision_filter_no.rrd"
@@ -39,8 +39,8 @@ def test_a_failure_is_recorded_with_what_was_seen_and_ranked(decider, tmp_path, 
     assert blueprint.GRASP not in entities(path)
 
 
-def test_a_chosen_episode_is_recorded_with_its_box_and_plan(decider, tmp_path):
-    path = record_scenario(SCENARIO, METHODS_OF_OURS["mvb"], lambda *_: decider, tmp_path)
+def test_a_chosen_episode_is_recorded_with_its_box_and_plan(selector, tmp_path):
+    path = record_scenario(SCENARIO, METHODS_OF_OURS["mvb"], lambda *_: selector, tmp_path)
     assert path == tmp_path / f"{SCENARIO.key}-mvb.rrd"
     assert entities(path) >= {blueprint.BOX, blueprint.GRASP, blueprint.PATH}
 
@@ -51,7 +51,7 @@ def test_a_success_is_recorded_only_with_all_others(tmp_path):
     assert Recordings(folder=tmp_path, choice="all").wants(success=True)
 
 
-def test_what_saw_nothing_is_not_recorded(decider, tmp_path):
+def test_what_saw_nothing_is_not_recorded(selector, tmp_path):
     hidden = replace(SCENARIO, occlusion=0.99)
-    assert record_scenario(hidden, METHODS_OF_OURS["mvb"], lambda *_: decider, tmp_path) is None
+    assert record_scenario(hidden, METHODS_OF_OURS["mvb"], lambda *_: selector, tmp_path) is None
     assert not list(tmp_path.iterdir())

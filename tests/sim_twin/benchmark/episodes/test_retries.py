@@ -17,7 +17,7 @@ MVB = METHODS["mvb"]
 
 
 @pytest.fixture(scope="module")
-def decider():
+def selector():
     return make_grasp_selector(RuntimeConfig(generator="antipodal", detector="tabletop", n_candidates=300))
 
 
@@ -42,31 +42,31 @@ class Grasped:
         monkeypatch.setattr(EpisodeRobot, "execute", execute)
 
 
-def test_after_a_miss_the_object_is_found_where_it_then_is(decider, monkeypatch):
+def test_after_a_miss_the_object_is_found_where_it_then_is(selector, monkeypatch):
     grasped = Grasped(monkeypatch, missing=1)
-    (row,) = run_scenario(SCENARIO, [MVB], lambda *_: decider, top_k=3)
+    (row,) = run_scenario(SCENARIO, [MVB], lambda *_: selector, top_k=3)
     assert row["modes"] == ["missed", "success"]
     assert row["success_after"] == [False, True, True]
     assert (row["attempts"], row["success"], row["success_top1"], row["top_k"]) == (2, True, False, 3)
     first, second = (plan.T_base_grasp[:3, 3] for plan in grasped.plans)
     assert second[1] - first[1] == pytest.approx(0.12, abs=0.03)
-    np.testing.assert_allclose(grasped.starts[1], [*z1.Q_HOME, decider.config.jaw_home], atol=5e-3)
+    np.testing.assert_allclose(grasped.starts[1], [*z1.Q_HOME, selector.config.jaw_home], atol=5e-3)
 
 
-def test_there_are_no_more_attempts_than_asked_for(decider, monkeypatch):
+def test_there_are_no_more_attempts_than_asked_for(selector, monkeypatch):
     grasped = Grasped(monkeypatch, missing=9)
-    (row,) = run_scenario(SCENARIO, [MVB], lambda *_: decider, top_k=1)
+    (row,) = run_scenario(SCENARIO, [MVB], lambda *_: selector, top_k=1)
     assert len(grasped.plans) == row["attempts"] == 1
     assert row["success_after"] == [False]
     assert row["given_up"] == ""
 
 
-def test_each_attempt_has_candidates_of_its_own_and_the_row_is_of_the_last(decider, monkeypatch):
+def test_each_attempt_has_candidates_of_its_own_and_the_row_is_of_the_last(selector, monkeypatch):
     seeds = []
 
     def make(_, seed):
         seeds.append(seed)
-        return decider
+        return selector
 
     outcomes = iter([Mode.MISSED, Mode.DROPPED, Mode.SLIPPED])
     monkeypatch.setattr(EpisodeRobot, "execute", lambda *_: Outcome(mode=next(outcomes)))
@@ -77,7 +77,7 @@ def test_each_attempt_has_candidates_of_its_own_and_the_row_is_of_the_last(decid
     assert len(set(seeds)) == 3
 
 
-def test_an_object_that_has_gone_ends_the_episode_with_the_reason(decider, monkeypatch):
+def test_an_object_that_has_gone_ends_the_episode_with_the_reason(selector, monkeypatch):
     monkeypatch.setattr(EpisodeRobot, "execute", lambda *_: Outcome(mode=Mode.KNOCKED))
     real = episode.occlude
     covered = []
@@ -87,22 +87,22 @@ def test_an_object_that_has_gone_ends_the_episode_with_the_reason(decider, monke
         return real(frame, share if len(covered) == 1 else 0.99, seed)
 
     monkeypatch.setattr(episode, "occlude", occlude)
-    (row,) = run_scenario(SCENARIO, [MVB], lambda *_: decider, top_k=3)
+    (row,) = run_scenario(SCENARIO, [MVB], lambda *_: selector, top_k=3)
     assert (row["attempts"], row["mode"]) == (1, "object knocked")
     assert row["given_up"].startswith("no detection: ")
 
 
 @pytest.mark.parametrize("mode", [Mode.TABLE_COLLISION, Mode.STOPPED])
-def test_what_would_stop_a_real_arm_is_not_tried_again(decider, monkeypatch, mode):
+def test_what_would_stop_a_real_arm_is_not_tried_again(selector, monkeypatch, mode):
     monkeypatch.setattr(EpisodeRobot, "execute", lambda *_: Outcome(mode=mode))
-    (row,) = run_scenario(SCENARIO, [MVB], lambda *_: decider, top_k=3)
+    (row,) = run_scenario(SCENARIO, [MVB], lambda *_: selector, top_k=3)
     assert (row["attempts"], row["modes"]) == (1, [mode.value])
 
 
-def test_what_slipped_but_hangs_is_put_down_before_the_jaws_open(decider):
+def test_what_slipped_but_hangs_is_put_down_before_the_jaws_open(selector):
     frame, q = capture(SCENARIO.scene())
-    plan = decider.select(frame, q).plan
-    with EpisodeRobot(SCENARIO.scene(), decider.kinematics) as robot:
+    plan = selector.select(frame, q).plan
+    with EpisodeRobot(SCENARIO.scene(), selector.kinematics) as robot:
         outcome = robot.execute(plan)
         assert outcome.mode is Mode.SUCCESS
         assert robot.world.lifted_m() > 0.05

@@ -33,18 +33,18 @@ def file(tmp_path):
 
 
 @pytest.fixture(scope="module")
-def decider():
+def selector():
     return make_grasp_selector(RuntimeConfig(detector="tabletop", n_candidates=200))
 
 
 @pytest.fixture(scope="module")
-def seen(decider):
-    frame = draw_can(decider.kinematics.flange(z1.Q_HOME) @ z1.T_FLANGE_CAMERA)
-    return SharedObservation.by(decider, frame, Q, StageTimes())
+def seen(selector):
+    frame = draw_can(selector.kinematics.flange(z1.Q_HOME) @ z1.T_FLANGE_CAMERA)
+    return SharedObservation.by(selector, frame, Q, StageTimes())
 
 
-def order(text, seen, decider):
-    best_first, left = parse_method(text).order(seen, decider, StageTimes())
+def order(text, seen, selector):
+    best_first, left = parse_method(text).order(seen, selector, StageTimes())
     return best_first.ranked, left[best_first.ranked.indices].tolist()
 
 
@@ -66,27 +66,27 @@ def test_invalid_methods_are_rejected(tmp_path):
         parse_method("vanilla:k=2")
 
 
-def test_full_uses_its_settings_and_else_the_configurations(seen, decider):
-    configured, one = METHODS["full"].ranking(decider.ranking), parse_method("full:k=1").ranking(decider.ranking)
-    assert configured == decider.ranking
-    assert one == replace(decider.ranking, k_faces=1)
-    assert len(order("full:k=1", seen, decider)[0]) < len(order("full", seen, decider)[0])
-    assert order("full:k=2", seen, decider)[1] == order("full", seen, decider)[1]
+def test_full_uses_its_settings_and_else_the_configurations(seen, selector):
+    configured, one = METHODS["full"].ranking(selector.ranking), parse_method("full:k=1").ranking(selector.ranking)
+    assert configured == selector.ranking
+    assert one == replace(selector.ranking, k_faces=1)
+    assert len(order("full:k=1", seen, selector)[0]) < len(order("full", seen, selector)[0])
+    assert order("full:k=2", seen, selector)[1] == order("full", seen, selector)[1]
 
 
-def test_a_head_orders_the_grasps_of_mvb_by_its_features(seen, decider, file):
-    best_first, _ = parse_method(f"mvb:scoring={file},k=2,hard_filter=yes").order(seen, decider, StageTimes())
+def test_a_head_orders_the_grasps_of_mvb_by_its_features(seen, selector, file):
+    best_first, _ = parse_method(f"mvb:scoring={file},k=2,hard_filter=yes").order(seen, selector, StageTimes())
     heights = measure_features(best_first.candidates)[:, 3]
     assert (np.diff(heights) <= 1e-9).all()
-    assert sorted(order(f"mvb:scoring={file},k=2,hard_filter=yes", seen, decider)[1]) == sorted(
-        order("mvb", seen, decider)[1]
+    assert sorted(order(f"mvb:scoring={file},k=2,hard_filter=yes", seen, selector)[1]) == sorted(
+        order("mvb", seen, selector)[1]
     )
 
 
-def test_what_is_below_a_threshold_comes_last_in_its_old_order(seen, decider):
-    plain, before = order("mvb", seen, decider)
+def test_what_is_below_a_threshold_comes_last_in_its_old_order(seen, selector):
+    plain, before = order("mvb", seen, selector)
     cut = float(np.median(plain.grasps.scores))
-    ranked, after = order(f"mvb:min_score={cut}", seen, decider)
+    ranked, after = order(f"mvb:min_score={cut}", seen, selector)
     wanted = {index: score >= cut for index, score in zip(before, plain.grasps.scores, strict=True)}
     assert after == sorted(before, key=lambda index: not wanted[index])
     assert not all(wanted.values())
