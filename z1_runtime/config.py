@@ -114,7 +114,7 @@ def load_config(path: Path | None = None) -> RuntimeConfig:
     """
     if path is None:
         return RuntimeConfig()
-    from hal.base.structure import read_yaml
+    from hal.base.files import read_yaml
 
     return config_from(read_yaml(path, "the configuration") or {}, str(path))
 
@@ -125,7 +125,7 @@ def config_from(data: Mapping[str, Any], where: str) -> RuntimeConfig:
     Raises:
         ConfigError: an unknown key or an invalid value; the message begins with `where`.
     """
-    from hal.base.structure import structure
+    from hal.base.files import structure
 
     return structure(RuntimeConfig, data, where)
 

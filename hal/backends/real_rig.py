@@ -9,8 +9,7 @@ from hal.backends.z1.arm import Z1Arm
 from hal.backends.z1.config import Z1ArmConfig
 from hal.base.clock import WallClock
 from hal.parking import Parking
-from hal.registry import CAMERAS
-from hal.rig import Rig
+from hal.rig import CAMERAS, Rig
 from hal.z1_protocol.controller import LABELS
 
 SEARCH_S = 1.0

@@ -1,11 +1,102 @@
-"""Atomic writing of files: readers find the old content or the complete new one."""
+"""Files: YAML into frozen dataclasses, with errors that name file and key; and atomic writing."""
 
 from __future__ import annotations
 
+import difflib
+import json
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import fields, is_dataclass
+from functools import cache
 from pathlib import Path
+from typing import Any, TypeVar, get_type_hints
+
+import yaml
+
+from hal.base.errors import ConfigError
+
+T = TypeVar("T")
+
+_EXTRA, _MISSING, _VALUE = "unexpected_keyword_argument", "missing", "value_error"
+
+
+def read_yaml(path: Path, what: str) -> Any:
+    """Return the content of the YAML file `path`.
+
+    Args:
+        path: the file.
+        what: its name in an error, such as "the configuration".
+
+    Raises:
+        ConfigError: `unreadable` or `not_yaml`.
+    """
+    try:
+        return yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"{what} {path} cannot be read: {error.strerror}.", code="unreadable") from error
+    except UnicodeDecodeError as error:
+        raise ConfigError(
+            f"{what} {path} is not UTF-8 text ({error.reason}); save it as UTF-8.", code="unreadable"
+        ) from error
+    except yaml.YAMLError as error:
+        raise ConfigError(f"{what} {path} is not YAML: {error}", code="not_yaml") from error
+
+
+def structure(kind: type[T], data: Any, where: str) -> T:
+    """Return `data`, as YAML and JSON give it, as the dataclass `kind`; missing keys take their defaults.
+
+    Types are strict: a text is no number, a whole number is a float but not the other way round.
+
+    Raises:
+        ConfigError: `unknown_key`, `missing_key`, `wrong_type` or `out_of_range`; the message begins with `where`,
+            `key` is the path.
+    """
+    from pydantic import ValidationError
+
+    try:
+        # JSON, since strict mode accepts its lists as tuples and its texts as paths
+        return _adapter(kind).validate_json(json.dumps(data), strict=True, extra="forbid")
+    except (TypeError, ValueError) as error:
+        if not isinstance(error, ValidationError):
+            raise ConfigError(f"{where} holds values that are no plain data: {error}.", code="wrong_type") from error
+        first = error.errors()[0]
+        raise _explain(first, kind, where) from error
+
+
+@cache
+def _adapter(kind: type) -> Any:
+    from pydantic import TypeAdapter
+
+    return TypeAdapter(kind)
+
+
+def _explain(found: Mapping[str, Any], kind: type, where: str) -> ConfigError:
+    path = tuple(str(part) for part in found["loc"])
+    key = ".".join(path)
+    if found["type"] == _EXTRA:
+        known = [field.name for field in fields(_type_at(kind, path[:-1]))]
+        near = difflib.get_close_matches(path[-1], known, n=1)
+        hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(known)}."
+        return ConfigError(f"{where} has an unknown key {key!r}; {hint}", code="unknown_key", key=key)
+    if found["type"] == _MISSING and isinstance(found["loc"][-1], str):  # a tuple lacks an index
+        return ConfigError(f"{where} lacks the key {key!r}.", code="missing_key", key=key)
+    if found["type"] == _VALUE:
+        reason = str(found["ctx"]["error"])
+        return ConfigError(f"{where}: {'.'.join((*path, reason))}", code="out_of_range", key=key)
+    expected = found["msg"].replace("Input should be", "it must be").replace("an object", "keys and values")
+    return ConfigError(
+        f"{where}: {key or 'the content'} is {found['input']!r}; {expected}.", code="wrong_type", key=key
+    )
+
+
+def _type_at(kind: Any, path: tuple[str, ...]) -> Any:
+    """Return the dataclass that the field path leads to."""
+    for name in path:
+        inner = get_type_hints(kind)[name]
+        kind = inner if is_dataclass(inner) else next(part for part in inner.__args__ if is_dataclass(part))
+    return kind
+
 
 PARTIAL = ".partial"
 """Ending of an unfinished file, after the name of the final one; only a killed process leaves one."""

@@ -19,8 +19,7 @@ from hal.servo.command_mailbox import CommandMailbox, Snapshot
 from hal.servo.control_loop import ControlCycle
 from hal.servo.guard import Guard
 from hal.servo.limits import ServoLimits, clip_setpoint
-from hal.servo.periods import PeriodStatistics
-from hal.servo.status import StatusLogger, make_health, make_status
+from hal.servo.status import PeriodStatistics, StatusLogger, make_health, make_status
 
 _STATE_MAX_AGE_S = 0.2  # 100 ticks; `BusConfig.state_max_age_s` is the same for clients
 

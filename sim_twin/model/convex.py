@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hal.base import z1
-from hal.base.z1_gripper import T_PIVOT_STATIONARY_JAW
+from hal.base.z1_shape import T_PIVOT_STATIONARY_JAW
 
 if TYPE_CHECKING:  # trimesh takes two seconds to import, and a scene's description needs none of it
     import trimesh

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from hal.backends.mock_arm import MockArm
 from hal.base.errors import InvalidValueError, UnknownBackendError
-from hal.registry import ARMS, Registry
+from hal.rig import ARMS, Registry
 from tests.support.errors import raises
 
 

@@ -91,7 +91,7 @@ def test_options_reach_the_command_and_its_code_comes_back(made_up: ModuleType) 
     [
         ("hal.servo.servo", HalTimeoutError("no answer"), 1),
         ("numpy", DegenerateCloudError("four points at least"), 1),
-        ("hal.registry", UnknownBackendError("arm", "x", ["mock"]), 2),
+        ("hal.rig", UnknownBackendError("arm", "x", ["mock"]), 2),
         ("z1_runtime.config", InvalidValueError("alpha is 3"), 2),
         ("scripts.commands.run_demo", PermissionError("out cannot be written"), 1),
         ("sim_twin.benchmark.results.store", OutputExistsError("out holds rows already"), 2),

@@ -10,8 +10,7 @@ from hal.base.camera import Camera
 from hal.base.clock import ManualClock, WallClock
 from hal.base.errors import HalTimeoutError, NotConnectedError
 from hal.base.messages import ArmSetpoint, RgbdFrame
-from hal.registry import ARMS, CAMERAS
-from hal.rig import RIGS, Rig
+from hal.rig import ARMS, CAMERAS, RIGS, Rig
 from sim_twin.backends import TwinArm, TwinCamera, make_rig
 from sim_twin.clock import TwinClock
 from sim_twin.model.scene import SceneConfig

@@ -8,7 +8,7 @@ import numpy as np
 
 from hal.base import z1
 from hal.base.transforms import transform_points
-from hal.base.z1_gripper import moving_jaw_pose
+from hal.base.z1_shape import moving_jaw_pose
 from z1_runtime.collision.collision_config import CollisionConfig
 from z1_runtime.collision.voxel_grid import SceneIndex
 from z1_runtime.geometry.gripper_mesh import gripper_shape

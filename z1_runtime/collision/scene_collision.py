@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hal.base import z1
-from hal.base.z1_gripper import moving_jaw_pose
-from hal.base.z1_shape import CAPSULES
+from hal.base.z1_shape import CAPSULES, moving_jaw_pose
 from z1_runtime.collision import self_collision
 from z1_runtime.collision.planning_scene import PlanningScene
 from z1_runtime.collision.self_collision import MAY_MEET_SCENE, ArmPoses, check_arm

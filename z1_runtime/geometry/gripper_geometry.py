@@ -1,6 +1,6 @@
 """Fit of the Z1's jaws around a disc, in the plane in which they close.
 
-Both inner faces (`hal.base.z1_gripper`) are flat for the 24 mm behind the tip (z = −9 mm with the jaws closed), then
+Both inner faces (`hal.base.z1_shape`) are flat for the 24 mm behind the tip (z = −9 mm with the jaws closed), then
 recede by about 23° towards the palm. The edge between the two parts, the *knee*, is 76.7 mm from the moving jaw's axis
 on both jaws. At an opening φ the flats are φ apart and would squeeze an object out like a wedge; the knees face each
 other squarely at every φ. A grasp therefore puts the knees on the contact axis, the object midway, and splits φ between
@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from hal.base.z1_gripper import KNEE_RADIUS_M, MOVING_FACE, PALM_RADIUS_M, STATIONARY_FACE
+from hal.base.z1_shape import KNEE_RADIUS_M, MOVING_FACE, PALM_RADIUS_M, STATIONARY_FACE
 
 _MAX_PAST_RATIO = 0.15  # of an object's radius: beyond it, a thin object would be behind the knees
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from hal.base import z1
 from hal.base.transforms import transform_points
-from hal.base.z1_gripper import PALM_RADIUS_M, T_PIVOT_STATIONARY_JAW
+from hal.base.z1_shape import PALM_RADIUS_M, T_PIVOT_STATIONARY_JAW
 
 _SPACING_M = 0.0085
 _JAW_SPACING_M = 0.005  # jaws pass the object within millimetres, and its edges must not fit between two points

@@ -14,8 +14,7 @@ import numpy as np
 import yaml
 
 from hal.base.errors import ConfigError, InvalidValueError, UsageError
-from hal.base.files import atomic_write
-from hal.base.structure import read_yaml, structure
+from hal.base.files import atomic_write, read_yaml, structure
 from models.obb.mvbb import FitMethod
 from z1_runtime.grasping.features import FEATURES, FORMER_NAMES
 

@@ -19,7 +19,7 @@ from hal.base import z1
 from hal.base.errors import InvalidValueError
 from hal.base.messages import RgbdFrame
 from hal.base.transforms import inverse, transform_points
-from hal.base.z1_gripper import T_FLANGE_STATIONARY_JAW, moving_jaw_pose
+from hal.base.z1_shape import T_FLANGE_STATIONARY_JAW, moving_jaw_pose
 
 _SAMPLES = {"z1_GripperStator": 50_000, "z1_GripperMover": 30_000}
 _ROUNDS, _FIRST_GATE_M, _LAST_GATE_M, _GATE_RATIO = 20, 0.012, 0.002, 0.75

@@ -11,7 +11,7 @@ from hal.base import z1
 from hal.base.errors import InvalidValueError
 from hal.base.messages import Intrinsics, RgbdFrame
 from hal.base.transforms import inverse, transform_points
-from hal.base.z1_gripper import moving_jaw_pose
+from hal.base.z1_shape import moving_jaw_pose
 from z1_runtime.geometry.gripper_mesh import gripper_shape
 
 _MIN_DEPTH_M = 0.02  # surface points nearer to the lens belong to the camera's own housing and bracket

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from hal.servo.periods import PeriodStatistics, PeriodSummary
+from hal.servo.status import PeriodStatistics, PeriodSummary
 
 
 def test_periods_are_summarised_only_while_measured() -> None:

@@ -22,8 +22,7 @@ from hal.base.clock import Clock, ManualClock, WallClock
 from hal.bus.client import RemoteArm, RemoteCamera
 from hal.bus.server import HalServer
 from hal.bus.session import BusConfig
-from hal.registry import ARMS, CAMERAS
-from hal.rig import RIGS
+from hal.rig import ARMS, CAMERAS, RIGS
 from hal.servo.servo import Servo
 from hal.servo.servo_thread import ServoThread
 from sim_twin.clock import TwinClock
