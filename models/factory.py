@@ -125,7 +125,7 @@ def _make_one(name: str, options: GeneratorOptions, weights: Path | None) -> Gra
 
         return ObbSweepSampler()
     if name in ("diffusion", "diffusion_z1"):
-        from models.diffusion.grippers import MAX_WIDTHS_M
+        from models.diffusion.network import MAX_WIDTHS_M
         from models.diffusion.sampler import DiffusionConfig, DiffusionSampler
 
         gripper = "agnostic" if name == "diffusion" else "z1"

@@ -1,4 +1,4 @@
-"""The twin's arm and camera behind the contracts of `hal`, in this process.
+"""The twin's arm, camera and clock behind the contracts of `hal`, in this process.
 
 Lock-step: the clock is a `TwinClock`, physics moves only during a sleep, and an episode is a pure function
 of its seed. Real time: the clock is the wall's, and the 500 Hz servo that reads the arm's state drives the physics.
@@ -11,6 +11,7 @@ import os
 import sys
 import threading
 from collections import deque
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any
@@ -22,13 +23,49 @@ from hal.base import z1
 from hal.base.clock import Clock, WallClock
 from hal.base.errors import HalTimeoutError, NotConnectedError
 from hal.base.messages import ArmSetpoint, ArmState, Intrinsics, RgbdFrame
+from hal.base.z1 import CONTROL_PERIOD_S
 from hal.rig import Rig
 from sim_twin.camera import d405
 from sim_twin.camera.render import make_renderer
 from sim_twin.camera.wrist_view import View, WristRenderer
-from sim_twin.clock import TwinClock
 from sim_twin.model.scene import SceneConfig
 from sim_twin.model.world import World
+
+
+class TwinClock:
+    """Lock-step: sleeping runs the physics, so an episode is a pure function of its seed. For one thread."""
+
+    def __init__(self, world: World) -> None:
+        self._world = world
+        self._ticks: list[Callable[[], None]] = []
+        self._sleeping = False
+
+    def now_s(self) -> float:
+        """Return the world's time [s]."""
+        return self._world.time_s
+
+    def call_every_tick(self, function: Callable[[], None]) -> None:
+        """Call `function` before each control step of a sleep, in the order of registration."""
+        self._ticks.append(function)
+
+    def sleep_until(self, t_s: float) -> None:
+        """Step the world until `now_s() >= t_s`; every tick function runs before each step.
+
+        Raises:
+            RuntimeError: a tick function slept on the clock that is calling it.
+        """
+        if self._sleeping:
+            raise RuntimeError("a function called every tick slept on the twin's clock; it must return at once.")
+        self._sleeping = True
+        try:
+            # Times are whole steps times the period: a nanosecond forgives the caller's own rounding.
+            while self._world.time_s < t_s - 1e-6 * CONTROL_PERIOD_S:
+                for function in self._ticks:
+                    function()
+                self._world.step()
+        finally:
+            self._sleeping = False
+
 
 _MAX_CATCH_UP_S = 0.020
 """Maximum simulated time that one read catches up; the rest of a delay is dropped: the world slows, never bursts."""

@@ -16,7 +16,7 @@ from hal.bus.service import Service
 from hal.bus.session import BusConfig, open_session
 
 if TYPE_CHECKING:
-    from sim_twin.model.scene_view import SceneView
+    from sim_twin.model.world import SceneView
 
 _KEY = "eval/ground_truth"
 _POSES = ("T_base_object", "T_flange_camera", "T_base_board")

@@ -14,9 +14,9 @@ from models.detector.runtimes import RUNTIMES
 from models.factory import Process, generator_for, split_generator_name
 from z1_runtime.grasping.ranking import Ranking, load_scoring
 from z1_runtime.motion.executor import ExecutorConfig
-from z1_runtime.perception.config import PerceptionConfig
-from z1_runtime.perception.detectors.factory import DETECTORS
-from z1_runtime.planning.planner_config import PlannerConfig
+from z1_runtime.perception.detector import DETECTORS
+from z1_runtime.perception.segmentation import PerceptionConfig
+from z1_runtime.planning.config import PlannerConfig
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -13,8 +13,7 @@ from models.types import GraspGenerator
 from z1_runtime.config import RuntimeConfig
 from z1_runtime.geometry.kinematics import Kinematics
 from z1_runtime.motion.trajectory import MotionLimits
-from z1_runtime.perception.detector import Detector
-from z1_runtime.perception.detectors.factory import make_detector
+from z1_runtime.perception.detector import Detector, make_detector
 from z1_runtime.perception.segmentation import Perception
 from z1_runtime.planning.planner import GraspPlanner
 from z1_runtime.tasks.grasp_selection import GraspSelector

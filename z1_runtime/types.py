@@ -45,7 +45,7 @@ class Observation:
     """(M, 3) everything else that was observed: the table, neighbours, walls; not the object."""
     table: Plane
     occluded_points: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
-    """(K, 3) where the object may continue behind an occlusion; see `z1_runtime.perception.occlusion`."""
+    """(K, 3) where the object may continue behind an occlusion; see `z1_runtime.perception.detectors.yolo`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -1,7 +1,7 @@
 """Clocks: the only place that reads the time or sleeps; all other code gets a `Clock`.
 
 On the robot it is the wall clock, in a test it is advanced by hand, and in lock-step it is the twin's
-(`sim_twin.clock.TwinClock`), so that a whole episode is a pure function of its seed.
+(`sim_twin.backends.TwinClock`), so that a whole episode is a pure function of its seed.
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ from numba import njit
 
 from hal.base import z1
 from hal.base.errors import InvalidValueError
-from hal.base.z1_shape import CAPSULE_PAIRS, CAPSULES, GRIPPER_OBSTACLES, GRIPPER_POINTS, MOVING_JAW_POINTS, TABLE_LINKS
+from hal.base.z1 import CAPSULE_PAIRS, CAPSULES, GRIPPER_OBSTACLES, GRIPPER_POINTS, MOVING_JAW_POINTS, TABLE_LINKS
 
 _LINKS = ("link00", "link01", "link02", "link03", "link04", "link05", "link06")
 _LINK = np.array([_LINKS.index(capsule.link) for capsule in CAPSULES])

@@ -12,10 +12,8 @@ from typing import Any, Protocol
 import numpy as np
 
 from hal.base.errors import InvalidValueError
-from models.detector.modules import MODULE_SUFFIXES, export_to_onnx, load_module
-from models.detector.weights import CAMERA_HW, detector_path
-from models.torch_threads import has_bfloat16, single_threaded_workers
-from models.weights_file import WeightsError
+from models.detector.weights import CAMERA_HW, MODULE_SUFFIXES, detector_path, export_to_onnx, load_module
+from models.weights_file import WeightsError, has_bfloat16, single_threaded_workers
 
 _PACKAGES = {"openvino": ("openvino",), "onnxruntime": ("onnxruntime",), "torch": ("torch", "ultralytics")}
 RUNTIMES = tuple(_PACKAGES)

@@ -7,8 +7,8 @@ import numpy as np
 from hal.base.transforms import inverse
 from models.diffusion.cloud import prepare_cloud
 from models.diffusion.sampler import DiffusionConfig
-from models.torch_threads import single_threaded_workers
 from models.types import GraspSet, check_object_cloud
+from models.weights_file import single_threaded_workers
 
 _PAD_HALF_WIDTH_M = 0.011  # half the finger width of the gripper that the weights were trained for
 _PAD_REACH_M = 0.03
@@ -29,7 +29,7 @@ class GraspScorer:
         Raises:
             WeightsError: they are missing, damaged or of another network.
         """
-        from models.diffusion.weights import load_weights, weights_path
+        from models.diffusion.network import load_weights, weights_path
 
         self.config = config or DiffusionConfig()
         _, self._discriminator = load_weights(self.config.weights or weights_path(self.config.gripper))

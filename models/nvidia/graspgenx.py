@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from hal.base.z1_shape import (
+from hal.base.z1 import (
     JAW_REACH_M,
     KNEE_RADIUS_M,
     PAD_HALF_WIDTH_M,

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from models.nvidia.errors import GeneratorError
-from models.torch_threads import single_threaded_workers
 from models.types import GraspGenerator, GraspSet, check_object_cloud
+from models.weights_file import single_threaded_workers
 
 T_NVIDIA_GRASP = np.array([[0.0, 1.0, 0.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 """(4, 4) this project's grasp frame in NVIDIA's: both approach along z; NVIDIA's closes along x, ours along y."""

@@ -8,8 +8,7 @@ from typing import Literal
 import numpy as np
 
 from hal.base.errors import InvalidValueError
-from models.obb.box_axes import min_volume_axes, principal_axes, upright_axes
-from models.obb.obb import FACE_AXES, DegenerateCloudError, OrientedBox
+from models.obb.obb import FACE_AXES, DegenerateCloudError, OrientedBox, min_volume_axes, principal_axes, upright_axes
 from models.types import GraspSet
 
 FitMethod = Literal["pca", "min_volume", "upright"]

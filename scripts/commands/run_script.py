@@ -83,7 +83,7 @@ def main(arguments: list[str]) -> int:
 @contextmanager
 def lockstep_robot(scene: SceneConfig) -> Iterator[Clock]:
     """Substitute the vendors' modules by a lock-step camera in a static scene."""
-    from sim_twin.clock import TwinClock
+    from sim_twin.backends import TwinClock
     from sim_twin.drop_in.realsense_source import TwinSource
     from sim_twin.model.world import World
 

@@ -19,11 +19,10 @@ from PIL import Image
 
 from hal.base import z1
 from scripts.docs.wrist_overlay import Layers, draw_caption, draw_mask, draw_overlay
-from sim_twin.backends import make_rig
+from sim_twin.backends import TwinClock, make_rig
 from sim_twin.camera import d405
 from sim_twin.camera.external_view import render_external
 from sim_twin.camera.render import make_renderer
-from sim_twin.clock import TwinClock
 from sim_twin.model.scene import SceneConfig, build_model
 from z1_runtime.config import load_config
 from z1_runtime.devices import Devices, connect_rig

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from hal.base.clock import Stopwatch
 from z1_runtime.collision.voxel_grid import SceneIndex
-from z1_runtime.geometry.gripper_mesh import gripper_shape
+from z1_runtime.geometry.gripper_geometry import gripper_shape
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

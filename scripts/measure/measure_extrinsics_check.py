@@ -21,7 +21,7 @@ from hal.base.clock import Stopwatch
 from hal.base.transforms import inverse, transform_points
 from sim_twin.benchmark.episodes.execution import capture
 from sim_twin.benchmark.episodes.scenarios import PAPER_OBJECTS, grid
-from z1_runtime.perception.extrinsics_check import ExtrinsicsCheck
+from z1_runtime.perception.extrinsics import ExtrinsicsCheck
 from z1_runtime.perception.self_filter import SelfFilter
 
 

@@ -162,7 +162,7 @@ def run_vision() -> None:
     from hal.base.z1 import Q_HOME, T_FLANGE_CAMERA
     from sim_twin.backends import make_rig
     from z1_runtime.geometry.kinematics import Kinematics
-    from z1_runtime.perception.detectors.factory import make_detector
+    from z1_runtime.perception.detector import make_detector
 
     detector = make_detector("yolo")
     rig = make_rig(lockstep=True)

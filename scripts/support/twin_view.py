@@ -11,7 +11,7 @@ import numpy as np
 import rerun as rr
 
 from hal.base.z1 import N_JOINTS
-from sim_twin.model.scene_view import SceneView
+from sim_twin.model.world import SceneView
 from sim_twin.model.z1_mjcf import GROUP_SCENE
 from z1_runtime.visualization import blueprint
 from z1_runtime.visualization.recorder import Recorder

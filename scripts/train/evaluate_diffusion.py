@@ -21,6 +21,7 @@ from rich.console import Console
 from rich.progress import track
 
 from hal.base.clock import Stopwatch
+from models.diffusion.network import weights_path
 from models.diffusion.sampler import DiffusionConfig, DiffusionSampler
 from models.diffusion.training.grippers import GRIPPERS, AnyGripper
 from models.diffusion.training.labels import find_grasps
@@ -28,7 +29,6 @@ from models.diffusion.training.metrics import measure_cloud, summarise
 from models.diffusion.training.shapes import HELD_OUT_FAMILIES, KNOWN_FAMILIES, make_shape
 from models.diffusion.training.solids import Solid
 from models.diffusion.training.views import ViewConfig, render_view
-from models.diffusion.weights import weights_path
 from models.samplers.antipodal import AntipodalConfig, AntipodalSampler
 from models.types import GraspGenerator
 

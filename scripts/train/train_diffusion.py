@@ -22,6 +22,7 @@ import torch
 import tyro
 from rich.console import Console
 
+from models.diffusion.network import load_weights, save_weights, weights_path
 from models.diffusion.training.data import GraspData, load_shards
 from models.diffusion.training.grippers import GRIPPERS
 from models.diffusion.training.labelled_samples import ProgressCallback, label_samples
@@ -32,7 +33,6 @@ from models.diffusion.training.training import (
     train_discriminator,
     train_generator,
 )
-from models.diffusion.weights import load_weights, save_weights, weights_path
 
 _REPORT_EVERY = 200
 

@@ -9,8 +9,8 @@ import numpy as np
 from PIL import Image
 
 from hal.base.messages import Intrinsics
-from sim_twin.camera.gl import Canvas, choose
 from sim_twin.camera.rays import RayCaster
+from sim_twin.camera.render import Canvas, choose
 from sim_twin.model.scene import SceneConfig, build_model
 from sim_twin.model.z1_mjcf import GROUP_MOUNT, GROUP_SCENE, GROUP_VISUAL
 
@@ -44,7 +44,7 @@ def render_external(
         data: its state.
         width: [px].
         height: [px].
-        kind: one of `sim_twin.camera.gl.RENDERERS`; by default what the environment variable says.
+        kind: one of `sim_twin.camera.render.RENDERERS`; by default what the environment variable says.
     """
     return choose(
         kind, lambda: _draw_with_gl(model, data, width, height), lambda: _draw_with_rays(model, data, width, height)

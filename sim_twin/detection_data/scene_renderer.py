@@ -13,8 +13,7 @@ import numpy as np
 
 from hal.base.messages import Intrinsics
 from sim_twin.camera.d405 import INTRINSICS
-from sim_twin.camera.gl import Canvas
-from sim_twin.camera.render import set_pinhole
+from sim_twin.camera.render import Canvas, set_pinhole
 from sim_twin.detection_data.props import (
     CLASSES,
     UNDRAWN_GROUP,

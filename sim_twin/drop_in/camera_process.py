@@ -14,7 +14,7 @@ from sim_twin.drop_in.child_process import ChildProcess
 from sim_twin.drop_in.process import WireProcess, load_model
 from sim_twin.drop_in.shared_memory import SharedWorld, make_memory, map_memory
 from sim_twin.model.scene import SceneConfig
-from sim_twin.model.scene_view import SceneView
+from sim_twin.model.world import SceneView
 
 _IMAGES = ("depth", "colour", "left", "right")
 _MAX_PIXELS = max(width * height for width, height in MIN_Z_M)

@@ -16,7 +16,7 @@ from sim_twin.drop_in.child_process import ChildProcess
 from sim_twin.drop_in.config import WireConfig
 from sim_twin.drop_in.shared_memory import SharedWorld, make_memory
 from sim_twin.model.scene import SceneConfig
-from sim_twin.model.scene_view import SceneView
+from sim_twin.model.world import SceneView
 
 if TYPE_CHECKING:
     from sim_twin.drop_in.udp_server import ArmEndpoint

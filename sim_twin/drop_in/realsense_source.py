@@ -12,13 +12,11 @@ import numpy as np
 from hal.base.clock import Clock, WallClock
 from hal.base.d405 import BASELINE_M, DEPTH_UNIT_M, MIN_Z_M, CaptureRequest, D405Calibration, Exposure
 from hal.base.messages import Intrinsics
-from sim_twin.backends import lower_thread_priority
+from sim_twin.backends import TwinClock, lower_thread_priority
 from sim_twin.camera import d405
 from sim_twin.camera.render import make_renderer
 from sim_twin.camera.wrist_view import View, WristRenderer, camera_id
-from sim_twin.clock import TwinClock
-from sim_twin.model.scene_view import SceneView
-from sim_twin.model.world import World
+from sim_twin.model.world import SceneView, World
 
 
 class TwinSource:
@@ -29,7 +27,7 @@ class TwinSource:
     Args:
         world: the scene.
         clock: a `TwinClock` of that world for lock-step (the default for a `World`), any other for free run.
-        renderer: one of `sim_twin.camera.gl.RENDERERS`; by default the environment's choice.
+        renderer: one of `sim_twin.camera.render.RENDERERS`; by default the environment's choice.
         calibration: optics of the unit; by default figures of real ones.
         low_priority: whether it renders at low priority in free run, as required in the process of a servo.
     """

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
@@ -12,10 +13,12 @@ from scipy.spatial.transform import Rotation
 
 from hal.base import z1
 from hal.base.errors import InvalidValueError
-from sim_twin.model.charuco_board import BoardSpec, add_board
 from sim_twin.model.objects import OBJECT_BODY, OBJECT_NAMES, OBJECTS, add_object
 from sim_twin.model.parts import GraspObject
 from sim_twin.model.z1_mjcf import BIT_BASE, BIT_GRIPPER, BIT_SCENE, CONTACT_SOLIMP, CONTACT_SOLREF, GROUP_SCENE, add_z1
+
+if TYPE_CHECKING:  # few scenes have a board
+    from sim_twin.model.charuco_board import BoardSpec
 
 PHYSICS_PERIOD_S = z1.CONTROL_PERIOD_S / 2
 """Two physics steps in a control period: contacts of 4 ms time constant need steps of 2 ms or less [s]."""
@@ -196,6 +199,8 @@ def _compile(config: SceneConfig) -> mujoco.MjModel:
     _add_surroundings(spec)
     add_z1(spec, config.T_flange_camera())
     if config.board is not None:
+        from sim_twin.model.charuco_board import add_board
+
         add_board(spec, config.board)
     add_object(spec, config.grasp_object, config.T_base_object(), mass_factor=config.mass_factor)
     for number, neighbour in enumerate(config.neighbours):

@@ -3,14 +3,120 @@
 from __future__ import annotations
 
 import threading
+from abc import ABC, abstractmethod
 
 import mujoco
 import numpy as np
 
 from hal.base import z1
-from sim_twin.model.fixture import Fixture
-from sim_twin.model.scene import PHYSICS_PERIOD_S, SceneConfig, build_model
-from sim_twin.model.scene_view import SceneView
+from sim_twin.model.objects import OBJECT_BODY
+from sim_twin.model.parts import JAW_LINKS
+from sim_twin.model.scene import FIXTURE, PHYSICS_PERIOD_S, SceneConfig, build_model
+
+
+class SceneView(ABC):
+    """A scene's poses: of a world in this process, or of another's.
+
+    Args:
+        config: of the scene.
+    """
+
+    start_height_m: float
+    """Height of the object's lowest point at the start [m]."""
+
+    def __init__(self, config: SceneConfig) -> None:
+        self.config = config
+        self._corners = config.grasp_object.corners()
+
+    @property
+    @abstractmethod
+    def model(self) -> mujoco.MjModel:
+        """MuJoCo's model of the scene."""
+
+    @abstractmethod
+    def poses(self) -> tuple[float, np.ndarray]:
+        """Return MuJoCo's time [s] and positions (14 + 7 N,): joints [rad], then position [m] and quaternion (wxyz) of
+        the object and of each of its N neighbours."""
+
+    def T_base_object(self) -> np.ndarray:
+        """Return the object's pose (4, 4): origin at mid-height on its axis, z along the axis."""
+        _, qpos = self.poses()
+        pose, rotation = np.eye(4), np.empty(9)
+        mujoco.mju_quat2Mat(rotation, qpos[z1.N_JOINTS + 3 : z1.N_JOINTS + 7])
+        pose[:3, :3], pose[:3, 3] = rotation.reshape(3, 3), qpos[z1.N_JOINTS : z1.N_JOINTS + 3]
+        return pose
+
+    def lifted_m(self) -> float:
+        """Return the rise of the object's lowest point since the start [m]."""
+        return self.lowest_m() - self.start_height_m
+
+    def lowest_m(self) -> float:
+        """Return the height of the object's lowest point [m]."""
+        pose = self.T_base_object()
+        return float((self._corners @ pose[2, :3]).min() + pose[2, 3])
+
+    def snapshot(self, into: mujoco.MjData | None = None) -> mujoco.MjData:
+        """Return the present poses in a copy of the state that no step will touch.
+
+        Args:
+            into: an earlier snapshot to write over, to save the allocation.
+        """
+        copy = into if into is not None else mujoco.MjData(self.model)
+        copy.time, copy.qpos[:] = self.poses()
+        mujoco.mj_kinematics(self.model, copy)
+        # MuJoCo computes cameras and lights after the centres of mass, which they may track
+        mujoco.mj_comPos(self.model, copy)
+        mujoco.mj_camlight(self.model, copy)
+        return copy
+
+
+BREAK_FORCE_N = 5.0
+BREAK_TRAVEL_M = 0.015
+_GRIP_FORCE_N = 1.0
+
+
+class Fixture:
+    """A weld to the world that releases once and for all.
+
+    It releases when the arm pushes the object with more than 5 N, when the object has moved 15 mm, or when both jaws
+    press on it with more than 1 N.
+    """
+
+    def __init__(self, model: mujoco.MjModel) -> None:
+        self._id = model.equality(FIXTURE).id
+        self._object = model.body(OBJECT_BODY).id
+        self._jaws = [model.body(name).id for name in JAW_LINKS]
+        self._start = model.body(OBJECT_BODY).pos.copy()
+
+    def update(self, model: mujoco.MjModel, data: mujoco.MjData) -> bool:
+        """Release the object if a limit is exceeded; return True once released."""
+        moved = np.linalg.norm(data.xpos[self._object] - self._start) > BREAK_TRAVEL_M
+        forces = self._forces_by_body(model, data) if not moved else {}
+        gripped = all(np.linalg.norm(forces.get(jaw, 0.0)) > _GRIP_FORCE_N for jaw in self._jaws)
+        pushed = np.linalg.norm(sum(forces.values(), np.zeros(3))) > BREAK_FORCE_N
+        if moved or gripped or pushed:
+            data.eq_active[self._id] = 0
+            return True
+        return False
+
+    def _forces_by_body(self, model: mujoco.MjModel, data: mujoco.MjData) -> dict[int, np.ndarray]:
+        """Return the contact force [N] on the object from each body of the arm, in the base frame."""
+        forces: dict[int, np.ndarray] = {}
+        wrench = np.empty(6)
+        bodies = model.geom_bodyid[data.contact.geom]
+        for index in np.flatnonzero((bodies == self._object).any(axis=1)):
+            first, second = bodies[index]
+            other = int(second if first == self._object else first)
+            # Body 0 is the world with the table, whose support is no push
+            if other == 0:
+                continue
+            mujoco.mj_contactForce(model, data, int(index), wrench)
+            # MuJoCo stores the contact frame's axes in rows, the normal first
+            force = data.contact.frame[index].reshape(3, 3).T @ wrench[:3]
+            # The contact force acts on the second geom along the frame's axes.
+            forces[other] = forces.get(other, np.zeros(3)) + (force if second == self._object else -force)
+        return forces
+
 
 GRIPPER_START_RAD = -1.0
 KP_MOTOR_MAX, KD_MOTOR_MAX = 1e4, 1e3

@@ -11,7 +11,7 @@ import pinocchio as pin  # pyright: ignore[reportMissingImports] - a .pth file l
 
 from hal.base import z1
 from hal.base.z1_model import rigid_body_model
-from sim_twin.model.convex import JAW_LINKS, load_visual_mesh, split_convex
+from sim_twin.model.parts import JAW_LINKS, load_visual_mesh, split_convex
 
 GROUP_SCENE = 0
 """Table and object: visible to every camera, collides."""

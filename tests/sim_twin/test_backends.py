@@ -11,8 +11,7 @@ from hal.base.clock import ManualClock, WallClock
 from hal.base.errors import HalTimeoutError, NotConnectedError
 from hal.base.messages import ArmSetpoint, RgbdFrame
 from hal.rig import ARMS, CAMERAS, RIGS, Rig
-from sim_twin.backends import TwinArm, TwinCamera, make_rig
-from sim_twin.clock import TwinClock
+from sim_twin.backends import TwinArm, TwinCamera, TwinClock, make_rig
 from sim_twin.model.scene import SceneConfig
 from sim_twin.model.world import World
 from tests.support.errors import raises

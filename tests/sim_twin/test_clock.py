@@ -1,7 +1,7 @@
 import pytest
 
 from hal.base.z1 import CONTROL_PERIOD_S
-from sim_twin.clock import TwinClock
+from sim_twin.backends import TwinClock
 from sim_twin.model.scene import SceneConfig
 from sim_twin.model.world import World
 

@@ -3,7 +3,7 @@
 import pytest
 
 from hal.base.errors import CameraError
-from sim_twin.camera.gl import open_egl
+from sim_twin.camera.render import open_egl
 
 
 def _has_egl() -> bool:

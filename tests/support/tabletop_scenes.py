@@ -8,14 +8,13 @@ from hal.base import z1
 from hal.base.messages import Intrinsics, RgbdFrame
 from hal.base.transforms import inverse
 from models.types import Detection, GraspSet
-from z1_runtime.collision.collision_config import CollisionConfig
-from z1_runtime.collision.planning_scene import PlanningScene
+from z1_runtime.collision.planning_scene import CollisionConfig, PlanningScene
 from z1_runtime.collision.scene_collision import CollisionChecker
 from z1_runtime.geometry.gripper_geometry import GripperPlacementConfig
 from z1_runtime.geometry.kinematics import Kinematics
 from z1_runtime.grasping.beak_gripper import BeakGripper
 from z1_runtime.grasping.grasp_candidates import EARLY_EXIT_CHUNK, GraspCandidates
-from z1_runtime.planning.planner_config import PlannerConfig
+from z1_runtime.planning.config import PlannerConfig
 from z1_runtime.types import Observation, Plane
 
 Q_START = np.append(z1.Q_HOME, -1.0)

@@ -14,7 +14,7 @@ import pyarrow.parquet as pq
 from sim_twin.benchmark.episodes.rows import Row
 from sim_twin.benchmark.episodes.scenarios import Scenario, grid
 from z1_runtime.config import RuntimeConfig
-from z1_runtime.grasping.features import FEATURES
+from z1_runtime.grasping.ranking import FEATURES
 
 
 def scenarios(*seeds: int) -> list[Scenario]:

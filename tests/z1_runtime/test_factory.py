@@ -15,7 +15,7 @@ from tests.support.errors import raises
 from z1_runtime.config import RuntimeConfig, load_config
 from z1_runtime.factory import make_grasp_selector
 from z1_runtime.motion.limits import MotionLimits
-from z1_runtime.planning.planner_config import PlannerConfig
+from z1_runtime.planning.config import PlannerConfig
 
 
 def test_each_name_makes_its_generator():

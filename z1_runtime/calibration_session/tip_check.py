@@ -17,7 +17,7 @@ from hal.base.arm import ServoedArm
 from hal.base.clock import Clock
 from hal.base.errors import InvalidValueError
 from hal.base.transforms import inverse, make_pose, transform_points
-from hal.base.z1_shape import JAW_REACH_M, STATIONARY_FACE
+from hal.base.z1 import JAW_REACH_M, STATIONARY_FACE
 from z1_runtime.calibration_session.viewpoints import plan_free_motion
 from z1_runtime.collision.scene_collision import CollisionChecker
 from z1_runtime.geometry.kinematics import Kinematics

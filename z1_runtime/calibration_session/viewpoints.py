@@ -17,8 +17,7 @@ from hal.base.errors import InvalidValueError, Z1Error
 from hal.base.messages import Intrinsics, RgbdFrame
 from hal.base.transforms import inverse, make_pose, transform_points
 from models.types import Detection
-from z1_runtime.collision.collision_config import CollisionConfig
-from z1_runtime.collision.planning_scene import PlanningScene
+from z1_runtime.collision.planning_scene import CollisionConfig, PlanningScene
 from z1_runtime.collision.scene_collision import CollisionChecker
 from z1_runtime.geometry.kinematics import Kinematics
 from z1_runtime.motion.trajectory import MotionLimits, joint_path

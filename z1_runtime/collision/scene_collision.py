@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from hal.base import z1
-from hal.base.z1_shape import CAPSULES, moving_jaw_pose
+from hal.base.z1 import CAPSULES, moving_jaw_pose
 from z1_runtime.collision import self_collision
 from z1_runtime.collision.planning_scene import PlanningScene
 from z1_runtime.collision.self_collision import MAY_MEET_SCENE, ArmPoses, check_arm
 from z1_runtime.collision.voxel_grid import SceneIndex
-from z1_runtime.geometry.gripper_mesh import gripper_shape
+from z1_runtime.geometry.gripper_geometry import gripper_shape
 from z1_runtime.geometry.kinematics import Kinematics
 from z1_runtime.types import JointTrajectory, PlanningStage, Rejection, RejectionReason
 

@@ -8,9 +8,9 @@ import numpy as np
 from numba import njit
 
 from hal.base import z1
-from hal.base.z1_shape import CAPSULE_PAIRS, CAPSULES, GRIPPER_OBSTACLES, TABLE_LINKS, moving_jaw_pose
+from hal.base.z1 import CAPSULE_PAIRS, CAPSULES, GRIPPER_OBSTACLES, TABLE_LINKS, moving_jaw_pose
 from hal.servo.guard import segment_distance, squared_distance
-from z1_runtime.geometry.gripper_mesh import gripper_shape
+from z1_runtime.geometry.gripper_geometry import gripper_shape
 from z1_runtime.geometry.kinematics import Kinematics
 from z1_runtime.types import Plane, PlanningStage, Rejection, RejectionReason
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from hal.base import z1
 from hal.base.errors import Z1Error
-from hal.base.z1_shape import moving_jaw_pose
+from hal.base.z1 import moving_jaw_pose
 from z1_runtime.geometry.gripper_geometry import GripperPlacementConfig, JawFit, fit_jaws
 from z1_runtime.types import PlanningStage, Rejection, RejectionReason
 

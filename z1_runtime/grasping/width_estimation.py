@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from hal.base.z1_shape import PAD_HALF_WIDTH_M
+from hal.base.z1 import PAD_HALF_WIDTH_M
 
 _PALM_HALF_WIDTH_M = 0.041
 _FRONT_MARGIN_M = 0.005  # points this far outside the width still move towards the palm between the jaws

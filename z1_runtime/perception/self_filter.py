@@ -1,4 +1,4 @@
-"""Self-filter: the pixels of the robot's own gripper, from its meshes at the jaw's angle."""
+"""The robot's own gripper in the image, from its meshes at the jaw's angle, and what it may occlude of the object."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ from hal.base import z1
 from hal.base.errors import InvalidValueError
 from hal.base.messages import Intrinsics, RgbdFrame
 from hal.base.transforms import inverse, transform_points
-from hal.base.z1_shape import moving_jaw_pose
-from z1_runtime.geometry.gripper_mesh import gripper_shape
+from hal.base.z1 import moving_jaw_pose
+from z1_runtime.geometry.gripper_geometry import gripper_shape
+from z1_runtime.perception.point_cloud import back_project
 
 _MIN_DEPTH_M = 0.02  # surface points nearer to the lens belong to the camera's own housing and bracket
 
@@ -68,3 +69,46 @@ class SelfFilter:
 def mask_depth(frame: RgbdFrame, pixels: np.ndarray) -> RgbdFrame:
     """Return `frame` with the depth of `pixels` (H, W) bool set to "not measured"."""
     return replace(frame, depth_m=np.where(pixels, 0.0, frame.depth_m))
+
+
+REACH_M = 0.015
+"""Distance to which the object is assumed to continue [m]."""
+MAX_POINTS = 1500
+"""Maximum number of points returned: each is tested against the gripper as an object's own."""
+_THIN_PX = 17  # narrower gaps come from the stereo matching: holes, and the shadow left of a near edge
+_TOUCH_PX = 5  # a gap that touches the object begins within this distance, past the pixels that filters removed
+
+
+def occluded_points(depth_m: np.ndarray, intrinsics: Intrinsics, solid: np.ndarray) -> np.ndarray:
+    """Return points (K, 3) in the camera frame [m] where the object may continue behind the gripper or a dark spot.
+
+    They extend the object's depth into unmeasured pixels, up to `REACH_M` from its border.
+
+    Args:
+        depth_m: (H, W), 0 where nothing was measured or the robot's own gripper is.
+        intrinsics: of that image.
+        solid: (H, W) bool, the object's measured pixels.
+    """
+    if not solid.any():
+        return np.zeros((0, 3))
+    gaps = cv2.morphologyEx((depth_m <= 0.0).astype(np.uint8), cv2.MORPH_OPEN, _square(_THIN_PX))
+    distance, label = cv2.distanceTransformWithLabels(
+        (~solid).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    label = np.asarray(label, dtype=np.intp)
+    reach_px = REACH_M * intrinsics.fx / float(np.median(depth_m[solid]))
+    near = (gaps > 0) & (distance < reach_px)
+    # Only gaps that begin at the object itself: one that the table separates from it occludes no more of it
+    touches = np.zeros(label.max() + 1, bool)
+    touches[label[near & (distance < _TOUCH_PX)]] = True
+    occluded = near & touches[label]
+    if not occluded.any():
+        return np.zeros((0, 3))
+    depth_of = np.zeros(label.max() + 1)
+    depth_of[label[solid]] = depth_m[solid]
+    points = back_project(depth_of[label], intrinsics, occluded)
+    return points[:: -(-len(points) // MAX_POINTS)]
+
+
+def _square(size_px: int) -> np.ndarray:
+    return np.ones((size_px, size_px), np.uint8)

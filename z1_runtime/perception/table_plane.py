@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hal.base.errors import InvalidValueError
-from z1_runtime.perception.errors import NoTableError
+from z1_runtime.perception.detector import NoTableError
 from z1_runtime.perception.point_cloud import check_cloud
 from z1_runtime.types import Plane
 

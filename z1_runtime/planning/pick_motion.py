@@ -15,7 +15,7 @@ from z1_runtime.geometry.kinematics import IkFailure, Kinematics
 from z1_runtime.grasping.beak_gripper import GripperPlacement
 from z1_runtime.motion.limits import MotionLimits
 from z1_runtime.motion.trajectory import PathFailure, concatenate, gripper_move, joint_path, straight_move
-from z1_runtime.planning.planner_config import PlannerConfig
+from z1_runtime.planning.config import PlannerConfig
 from z1_runtime.types import JointTrajectory, PlanningStage, Rejection, RejectionReason
 
 StageTimer = Callable[[str], AbstractContextManager[None]]

@@ -21,8 +21,8 @@ from z1_runtime.geometry.kinematics import Kinematics
 from z1_runtime.grasping import width_estimation
 from z1_runtime.grasping.grasp_candidates import GraspCandidates
 from z1_runtime.motion.limits import MotionLimits
+from z1_runtime.planning.config import PlannerConfig
 from z1_runtime.planning.pick_motion import PickMotion, PickMotionPlanner, StageTimer
-from z1_runtime.planning.planner_config import PlannerConfig
 from z1_runtime.types import GraspPlan, IkMethod, Rejection, RejectionReason
 
 

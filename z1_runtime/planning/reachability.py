@@ -19,10 +19,9 @@ from models.obb.obb import OrientedBox
 from z1_runtime.collision.scene_collision import CollisionChecker
 from z1_runtime.geometry.kinematics import Kinematics
 from z1_runtime.grasping.beak_gripper import GripperPlacement
-from z1_runtime.grasping.features import measure_features, object_centre_from_table
 from z1_runtime.grasping.grasp_candidates import GraspCandidates
-from z1_runtime.grasping.ranking import Ranking
-from z1_runtime.planning.planner_config import PlannerConfig
+from z1_runtime.grasping.ranking import Ranking, measure_features, object_centre_from_table
+from z1_runtime.planning.config import PlannerConfig
 
 _FULL_MARGIN_RAD = 0.25  # from the nearest joint limit; more counts no more
 _FULL_SINGULAR_VALUE = 0.12  # of the Jacobian, its smallest; more counts no more

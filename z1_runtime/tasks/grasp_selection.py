@@ -29,9 +29,8 @@ from z1_runtime.collision.scene_collision import CollisionChecker
 from z1_runtime.config import RuntimeConfig, ranking_of
 from z1_runtime.geometry.kinematics import Kinematics
 from z1_runtime.grasping.beak_gripper import BeakGripper
-from z1_runtime.grasping.features import fit_upright_box
 from z1_runtime.grasping.grasp_candidates import GraspCandidates
-from z1_runtime.grasping.ranking import Ranking
+from z1_runtime.grasping.ranking import Ranking, fit_upright_box
 from z1_runtime.perception.segmentation import Perception
 from z1_runtime.planning.planner import GraspPlanner, NoPlanError
 from z1_runtime.planning.reachability import RankedCandidates, ReachabilityRanker

@@ -19,7 +19,7 @@ from models.obb.obb import DegenerateCloudError
 from z1_runtime.config import RuntimeConfig
 from z1_runtime.motion.executor import Executor
 from z1_runtime.motion.trajectory import MotionLimits, hold, joint_move
-from z1_runtime.perception.errors import PerceptionError
+from z1_runtime.perception.detector import PerceptionError
 from z1_runtime.planning.planner import NoPlanError
 from z1_runtime.tasks.grasp_selection import GraspSelection, GraspSelector
 from z1_runtime.types import GraspPlan

@@ -10,9 +10,8 @@ import numpy as np
 from hal.base import z1
 from hal.base.messages import Intrinsics, RgbdFrame
 from models.types import Detection
-from z1_runtime.perception import extrinsics_check
-from z1_runtime.perception.detector import mask_box
-from z1_runtime.perception.errors import PerceptionError
+from z1_runtime.perception.detector import PerceptionError, mask_box
+from z1_runtime.perception.extrinsics import warm_up_extrinsics_check
 from z1_runtime.planning.planner import NoPlanError
 from z1_runtime.tasks.grasp_selection import GraspSelector
 
@@ -27,7 +26,7 @@ def warm_up_selector(selector: GraspSelector) -> None:
     """Run all stages of `selector` once on a drawn can; no camera and no arm are needed."""
     config = selector.config
     if config.perception.extrinsics_check.enabled:
-        extrinsics_check.warm_up()  # no jaws are in the drawn scene
+        warm_up_extrinsics_check()  # no jaws are in the drawn scene
     q = np.append(z1.Q_HOME, config.jaw_home)
     T_base_camera = selector.kinematics.flange(z1.Q_HOME) @ selector.T_flange_camera
     frame = draw_can(T_base_camera)

@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from hal.base.errors import InvalidValueError
-from models.diffusion.grippers import MAX_WIDTHS_M
+from models.diffusion.network import MAX_WIDTHS_M
 from models.diffusion.training.z1_gripper import Z1GripperSpec
 
 

@@ -1,6 +1,6 @@
 """The Z1's gripper as a target of the training: one stationary jaw, and one that turns, fitted around a width.
 
-`pivot` is the frame of the moving jaw's axis (`hal.base.z1_shape`): x towards the tips, y along the axis, the
+`pivot` is the frame of the moving jaw's axis (`hal.base.z1`): x towards the tips, y along the axis, the
 stationary jaw at −z. In the grasp frame y runs from the stationary jaw to the moving one, so this gripper is not its
 own mirror image.
 """
@@ -14,7 +14,7 @@ from typing import ClassVar
 import numpy as np
 from numba import njit
 
-from hal.base.z1_shape import (
+from hal.base.z1 import (
     HALF_WIDTH,
     MOVING_BACK,
     MOVING_FACE,
@@ -25,7 +25,7 @@ from hal.base.z1_shape import (
     WRIST_HALF_M,
     WRIST_X_M,
 )
-from models.diffusion.grippers import MAX_WIDTHS_M
+from models.diffusion.network import MAX_WIDTHS_M
 from models.diffusion.training.solids import distance_at, normal_at, trace
 
 GRIPPER_FIT = (

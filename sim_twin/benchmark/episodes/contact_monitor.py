@@ -5,8 +5,8 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from sim_twin.model.convex import JAW_LINKS
 from sim_twin.model.objects import OBJECT_BODY
+from sim_twin.model.parts import JAW_LINKS
 from sim_twin.model.scene import neighbour_body
 from sim_twin.model.world import World
 

@@ -18,9 +18,9 @@ from sim_twin.benchmark.episodes.recordings import Recordings, record
 from sim_twin.benchmark.episodes.rows import Attempt, Row, make_error_row, make_row
 from sim_twin.benchmark.episodes.scenarios import Scenario
 from sim_twin.benchmark.episodes.shared_observation import SharedObservation
-from z1_runtime.grasping.features import measure_features
+from z1_runtime.grasping.ranking import measure_features
 from z1_runtime.motion.executor import MotionError
-from z1_runtime.perception.errors import PerceptionError
+from z1_runtime.perception.detector import PerceptionError
 from z1_runtime.planning.planner import NoPlanError
 from z1_runtime.planning.reachability import RankedCandidates
 from z1_runtime.tasks.grasp_selection import GraspSelector, StageTimes

@@ -11,9 +11,8 @@ import numpy as np
 from hal.base.errors import InvalidValueError
 from models.obb.mvbb import FitMethod, RankedGrasps, fit_obb, rank_by_score, rank_grasps
 from sim_twin.benchmark.episodes.shared_observation import SharedObservation
-from z1_runtime.grasping.features import fit_upright_box, measure_features
 from z1_runtime.grasping.grasp_candidates import EARLY_EXIT_CHUNK
-from z1_runtime.grasping.ranking import Ranking, ScoringHead, load_scoring
+from z1_runtime.grasping.ranking import Ranking, ScoringHead, fit_upright_box, load_scoring, measure_features
 from z1_runtime.planning.reachability import RankedCandidates
 from z1_runtime.tasks.grasp_selection import GraspSelector, StageTimes
 

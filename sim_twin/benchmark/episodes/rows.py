@@ -17,7 +17,7 @@ from sim_twin.benchmark.episodes.execution import Mode, Outcome
 from sim_twin.benchmark.episodes.scenarios import Scenario
 from sim_twin.benchmark.episodes.shared_observation import SharedObservation
 from sim_twin.benchmark.episodes.targeting import compute_iou
-from z1_runtime.grasping.features import FEATURES
+from z1_runtime.grasping.ranking import FEATURES
 from z1_runtime.tasks.grasp_selection import StageTimes
 from z1_runtime.types import GraspPlan, Rejection, RejectionReason
 
@@ -42,7 +42,7 @@ class Attempt:
     plan: GraspPlan | None = None
     rejections: Sequence[Rejection] = ()
     features: np.ndarray | None = None
-    """(2, 11) of `z1_runtime.grasping.features.FEATURES`, of the first-ranked and, if there is a plan, of the executed
+    """(2, 11) of `z1_runtime.grasping.ranking.FEATURES`, of the first-ranked and, if there is a plan, of the executed
     grasp."""
 
     @property

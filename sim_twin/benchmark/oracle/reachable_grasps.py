@@ -18,8 +18,7 @@ from sim_twin.model.objects import OBJECTS
 from sim_twin.model.scene import SceneConfig
 from sim_twin.model.world import GRIPPER_START_RAD
 from z1_runtime.collision import scene_collision
-from z1_runtime.collision.collision_config import CollisionConfig
-from z1_runtime.collision.planning_scene import PlanningScene
+from z1_runtime.collision.planning_scene import CollisionConfig, PlanningScene
 from z1_runtime.collision.scene_collision import CollisionChecker
 from z1_runtime.geometry.gripper_geometry import GripperPlacementConfig
 from z1_runtime.geometry.kinematics import Kinematics
@@ -27,9 +26,9 @@ from z1_runtime.grasping import width_estimation
 from z1_runtime.grasping.beak_gripper import BeakGripper, GripperPlacement
 from z1_runtime.grasping.grasp_candidates import GraspCandidates
 from z1_runtime.motion.trajectory import MotionLimits
+from z1_runtime.planning.config import PlannerConfig
 from z1_runtime.planning.pick_motion import PickMotionPlanner
 from z1_runtime.planning.planner import make_plan
-from z1_runtime.planning.planner_config import PlannerConfig
 from z1_runtime.planning.reachability import ReachabilityRanker
 from z1_runtime.types import GraspPlan, Observation, Plane, Rejection, RejectionReason
 

@@ -20,7 +20,7 @@ from sim_twin.benchmark.episodes.scenarios import Scenario
 from sim_twin.benchmark.oracle.candidates import SweepConfig
 from sim_twin.benchmark.oracle.reachable_grasps import EXACT_PLANNER, GraspQueue, GroundTruthScene
 from z1_runtime.geometry.kinematics import Kinematics
-from z1_runtime.planning.planner_config import PlannerConfig
+from z1_runtime.planning.config import PlannerConfig
 from z1_runtime.types import GraspPlan, Rejection, RejectionReason
 
 METHOD = "oracle"

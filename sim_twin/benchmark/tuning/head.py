@@ -9,8 +9,7 @@ import numpy as np
 
 from sim_twin.benchmark.tuning.folds import make_folds
 from sim_twin.benchmark.tuning.logged_episodes import Samples
-from z1_runtime.grasping.features import FEATURES
-from z1_runtime.grasping.ranking import ScoringHead
+from z1_runtime.grasping.ranking import FEATURES, ScoringHead
 
 PENALTIES = (0.01, 0.1, 1.0, 10.0)
 """Inverse strengths of the L2 penalty that cross-validation chooses from."""

@@ -16,7 +16,7 @@ from hal.base.errors import UsageError
 from sim_twin.benchmark.episodes.rows import Row
 from sim_twin.benchmark.results.store import FOLDER, TABLE
 from z1_runtime.config import RuntimeConfig, config_from
-from z1_runtime.grasping.features import FEATURES
+from z1_runtime.grasping.ranking import FEATURES
 
 Reading = Literal["top1", "fallthrough"]
 """`top1`: only the first-ranked grasp counts; `fallthrough`: the first reachable one is executed."""
@@ -127,7 +127,7 @@ class Samples:
     """N different grasps with a known outcome."""
 
     features: np.ndarray
-    """(N, 11) as `z1_runtime.grasping.features.measure` returns it."""
+    """(N, 11) as `z1_runtime.grasping.ranking.measure` returns it."""
     success: np.ndarray
     """(N,) bool."""
     poses: np.ndarray

@@ -13,7 +13,7 @@ from sim_twin.benchmark.tuning.fit import Family, Tuning
 from sim_twin.benchmark.tuning.head import HeadReport, Skill
 from sim_twin.benchmark.tuning.thresholds import Threshold
 from sim_twin.benchmark.tuning.variants import format_ranking
-from z1_runtime.grasping.features import FEATURES
+from z1_runtime.grasping.ranking import FEATURES
 
 
 def write_tuning_report(tuning: Tuning, path: Path) -> None:

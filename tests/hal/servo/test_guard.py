@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from hal.base import z1
 from hal.base.errors import GuardError, InvalidValueError
 from hal.base.messages import ServoMode, TrajectoryChunk
-from hal.base.z1_shape import GRIPPER_POINTS
+from hal.base.z1 import GRIPPER_POINTS
 from hal.servo.guard import Guard, Workspace, segment_distance
 from tests.support.errors import raises
 from tests.support.hal.servo_bench import START, Bench, move, setpoint

@@ -8,11 +8,10 @@ import pytest
 import torch
 
 from hal.base.errors import InvalidValueError
-from models.detector import modules, runtimes
-from models.detector.detector import YoloConfig, YoloModel, best_of, labels_for
-from models.detector.image import Letterbox
+from models.detector import runtimes
+from models.detector.detector import Letterbox, YoloConfig, YoloModel, best_of, labels_for
 from models.detector.runtimes import RUNTIMES, installed_runtimes, open_network
-from models.detector.weights import CLASSES, save_detector
+from models.detector.weights import CLASSES, export_to_onnx, save_detector
 from models.types import Detection
 from models.weights_file import WeightsError
 from tests.support.detector_networks import detecting, picture, save_checkpoint, segmenting
@@ -250,13 +249,13 @@ def test_without_a_writable_home_the_export_is_temporary(ours, monkeypatch, tmp_
     file.touch()
     monkeypatch.setenv("XDG_CACHE_HOME", str(file))
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    assert modules.export_to_onnx(ours).is_relative_to(tmp_path)
+    assert export_to_onnx(ours).is_relative_to(tmp_path)
 
 
 @pytest.mark.parametrize("runtime", ["openvino", "onnxruntime"])
 def test_an_onnx_file_of_a_user_is_read(ours, tmp_path, runtime):
     path = tmp_path / "mine.onnx"
-    path.write_bytes(modules.export_to_onnx(ours).read_bytes())
+    path.write_bytes(export_to_onnx(ours).read_bytes())
     opened = open_network(path, runtime)
     assert (opened.names, opened.input_hw) == (CLASSES, SIZE)
     with raises(InvalidValueError, "runtime_unavailable"):
@@ -267,7 +266,7 @@ def test_an_openvino_folder_of_a_user_is_read(ours, tmp_path):
     import openvino
 
     folder = tmp_path / "mine_openvino_model"
-    openvino.save_model(openvino.Core().read_model(modules.export_to_onnx(ours)), folder / "mine.xml")
+    openvino.save_model(openvino.Core().read_model(export_to_onnx(ours)), folder / "mine.xml")
     (folder / "metadata.yaml").write_text("task: segment\nnames:\n  0: bottle\n  1: cylinder\n  2: box\n")
     assert installed_runtimes(folder / "mine.xml") == ("openvino",)
     detectors = [YoloModel(YoloConfig(weights=path)) for path in (folder, folder / "mine.xml", ours)]

@@ -12,13 +12,12 @@ from scipy.stats.qmc import discrepancy
 
 from hal.base.errors import InvalidValueError
 from hal.base.transforms import inverse
-from models.diffusion.sampler import DiffusionConfig, DiffusionSampler, draw_even_normal
-from models.diffusion.selection import choose_grasps
+from models.diffusion.network import WeightsError
+from models.diffusion.sampler import DiffusionConfig, DiffusionSampler, choose_grasps, draw_even_normal
 from models.diffusion.training.grippers import GRIPPERS
 from models.diffusion.training.labels import check_grasps
 from models.diffusion.training.shapes import make_shape
 from models.diffusion.training.views import ViewConfig, render_view
-from models.diffusion.weights import WeightsError
 from tests.support.errors import raises
 
 VIEW = ViewConfig(occluded_view_ratio=0.0, flying_point_ratio=0.0)

@@ -3,8 +3,7 @@
 import pytest
 import torch
 
-from models.diffusion.network import Denoiser, Discriminator
-from models.diffusion.weights import load_weights, save_weights, weights_path
+from models.diffusion.network import Denoiser, Discriminator, load_weights, save_weights, weights_path
 from models.weights_file import WeightsError, verify_sha256
 from tests.support.errors import raises
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import nn
 
-from hal.base import z1_shape
+from hal.base import z1
 from hal.base.errors import InvalidValueError
 from models.factory import GeneratorOptions, generator_for, make_generator, split_generator_name
 from models.nvidia import pointnet_ops
@@ -173,14 +173,14 @@ def test_the_compiled_ops_are_replaced_within_only():
 
 
 def test_the_z1_s_description_is_made_from_its_measured_gripper():
-    opened = 2.0 * np.arcsin(0.065 / 2.0 / z1_shape.KNEE_RADIUS_M)  # both knees touch 65 mm
-    to_axis_m = -z1_shape.T_PIVOT_STATIONARY_JAW[0, 3]
+    opened = 2.0 * np.arcsin(0.065 / 2.0 / z1.KNEE_RADIUS_M)  # both knees touch 65 mm
+    to_axis_m = -z1.T_PIVOT_STATIONARY_JAW[0, 3]
     boxes = []
     for angle in (opened, opened / 2.0):
-        between_knees = 2.0 * z1_shape.KNEE_RADIUS_M * np.sin(angle / 2.0)
-        tips = to_axis_m + z1_shape.JAW_REACH_M * np.cos(angle / 2.0)
-        palm = to_axis_m + z1_shape.PALM_RADIUS_M
-        boxes += [between_knees, 2.0 * z1_shape.PAD_HALF_WIDTH_M, tips - palm, 0.0, 0.0, (tips + palm) / 2.0]
+        between_knees = 2.0 * z1.KNEE_RADIUS_M * np.sin(angle / 2.0)
+        tips = to_axis_m + z1.JAW_REACH_M * np.cos(angle / 2.0)
+        palm = to_axis_m + z1.PALM_RADIUS_M
+        boxes += [between_knees, 2.0 * z1.PAD_HALF_WIDTH_M, tips - palm, 0.0, 0.0, (tips + palm) / 2.0]
     assert sweep_numbers() == pytest.approx(boxes, abs=6e-4)
 
 

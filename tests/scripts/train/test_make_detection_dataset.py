@@ -11,7 +11,7 @@ import pytest
 
 from hal.base.errors import CameraError
 from scripts.train.make_detection_dataset import SPLITS, Config, main, plan_shards, read_labels, to_line
-from sim_twin.camera.gl import open_egl
+from sim_twin.camera.render import open_egl
 from sim_twin.detection_data.props import CLASSES
 from sim_twin.detection_data.scenes import Label
 

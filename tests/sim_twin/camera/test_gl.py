@@ -6,10 +6,9 @@ import sys
 import pytest
 
 from hal.base.errors import CameraError, InvalidValueError
-from sim_twin.camera import gl
+from sim_twin.camera import render
 from sim_twin.camera.d405 import INTRINSICS
-from sim_twin.camera.gl import RENDER_VARIABLE, choose
-from sim_twin.camera.render import make_renderer
+from sim_twin.camera.render import RENDER_VARIABLE, choose, make_renderer
 from sim_twin.model.world import World
 from tests.support.errors import raises
 
@@ -28,7 +27,7 @@ def test_an_unknown_renderer_is_rejected(monkeypatch: pytest.MonkeyPatch, world:
 def test_without_gl_rays_are_cast_with_one_warning(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, set_to: str | None
 ) -> None:
-    monkeypatch.setattr(gl, "_warned", False)
+    monkeypatch.setattr(render, "_warned", False)
     monkeypatch.delenv(RENDER_VARIABLE, raising=False)
     if set_to is not None:
         monkeypatch.setenv(RENDER_VARIABLE, set_to)
@@ -56,7 +55,7 @@ def test_gl_that_was_asked_for_and_is_not_there_is_an_error_and_rays_never_try_i
 )
 def test_every_way_of_having_no_egl_ends_with_rays(environment: dict[str, str]) -> None:
     program = (
-        "from sim_twin.camera.gl import choose, open_egl; "
+        "from sim_twin.camera.render import choose, open_egl; "
         "print(choose('auto', lambda: open_egl(16, 16), lambda: 'rays'))"
     )
     done = subprocess.run(

@@ -3,8 +3,7 @@ import pytest
 
 from sim_twin.camera.d405 import INTRINSICS
 from sim_twin.camera.render import make_renderer
-from sim_twin.model.more_objects import EXTENDED
-from sim_twin.model.objects import OBJECTS
+from sim_twin.model.objects import EXTENDED, OBJECTS
 from sim_twin.model.parts import make_homogeneous_lathe, make_wall
 from sim_twin.model.scene import SceneConfig
 from sim_twin.model.world import World

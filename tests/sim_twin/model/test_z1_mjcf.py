@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from hal.base import z1
-from sim_twin.model.convex import load_link_mesh, split_convex
+from sim_twin.model.parts import load_link_mesh, split_convex
 from sim_twin.model.world import World
 from sim_twin.model.z1_mjcf import add_z1
 

@@ -25,7 +25,7 @@ from hal.bus.session import BusConfig
 from hal.rig import ARMS, CAMERAS, RIGS
 from hal.servo.servo import Servo
 from hal.servo.servo_thread import ServoThread
-from sim_twin.clock import TwinClock
+from sim_twin.backends import TwinClock
 from sim_twin.controller.controlled_world import ControlledWorld
 from sim_twin.drop_in.realsense_source import TwinSource
 from sim_twin.model.scene import SceneConfig

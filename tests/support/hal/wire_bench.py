@@ -14,7 +14,7 @@ from hal.base import z1
 from hal.base.messages import ServoMode, ServoStatus, TrajectoryChunk
 from hal.servo.servo import Servo
 from hal.z1_protocol.records import JointCommands
-from sim_twin.clock import TwinClock
+from sim_twin.backends import TwinClock
 from sim_twin.controller.controlled_world import ControlledWorld
 from sim_twin.model.scene import SceneConfig
 from sim_twin.model.world import World

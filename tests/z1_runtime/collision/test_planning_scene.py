@@ -12,7 +12,7 @@ from hal.base.errors import InvalidValueError
 from tests.support.errors import raises
 from tests.support.tabletop_scenes import Q_START, camera_pose, cylinder, make_observation, wall
 from z1_runtime.collision.planning_scene import PlanningScene
-from z1_runtime.geometry.gripper_mesh import gripper_shape
+from z1_runtime.geometry.gripper_geometry import gripper_shape
 from z1_runtime.geometry.kinematics import Kinematics
 from z1_runtime.types import Observation
 

@@ -19,9 +19,9 @@ from tests.support.tabletop_scenes import (
     make_observation,
     wall,
 )
-from z1_runtime.collision.collision_config import CollisionConfig
+from z1_runtime.collision.planning_scene import CollisionConfig
 from z1_runtime.collision.scene_collision import CollisionChecker
-from z1_runtime.geometry.gripper_mesh import gripper_shape
+from z1_runtime.geometry.gripper_geometry import gripper_shape
 from z1_runtime.geometry.kinematics import Kinematics
 from z1_runtime.grasping.beak_gripper import BeakGripper
 from z1_runtime.motion.limits import MotionLimits

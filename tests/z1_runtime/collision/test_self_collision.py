@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from hal.base import z1
-from hal.base.z1_shape import CAPSULES
+from hal.base.z1 import CAPSULES
 from tests.support.tabletop_scenes import camera_pose, cylinder, make_checker, make_observation
 from z1_runtime.collision.scene_collision import CollisionChecker
 from z1_runtime.collision.self_collision import ArmPoses, check_arm

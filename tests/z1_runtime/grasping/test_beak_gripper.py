@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from hal.base import z1
 from hal.base.transforms import inverse
-from hal.base.z1_shape import JAW_REACH_M, KNEE_RADIUS_M, MOVING_FACE, STATIONARY_FACE, moving_jaw_pose
+from hal.base.z1 import JAW_REACH_M, KNEE_RADIUS_M, MOVING_FACE, STATIONARY_FACE, moving_jaw_pose
 from tests.support.errors import raises
 from z1_runtime.geometry.gripper_geometry import GripperPlacementConfig
 from z1_runtime.grasping.beak_gripper import BeakGripper, WidthError

@@ -23,9 +23,17 @@ from tests.support.tabletop_scenes import (
 from z1_runtime.config import RuntimeConfig
 from z1_runtime.factory import make_grasp_selector
 from z1_runtime.geometry.kinematics import Kinematics
-from z1_runtime.grasping.features import FEATURES, fit_upright_box, measure_features
-from z1_runtime.grasping.ranking import Ranking, Scoring, ScoringError, ScoringHead, save_scoring
-from z1_runtime.planning.planner_config import PlannerConfig
+from z1_runtime.grasping.ranking import (
+    FEATURES,
+    Ranking,
+    Scoring,
+    ScoringError,
+    ScoringHead,
+    fit_upright_box,
+    measure_features,
+    save_scoring,
+)
+from z1_runtime.planning.config import PlannerConfig
 from z1_runtime.planning.reachability import ReachabilityRanker
 from z1_runtime.tasks.grasp_selection import GraspSelector
 from z1_runtime.tasks.warm_up import draw_can

@@ -11,8 +11,15 @@ import yaml
 
 from tests.support.errors import raises
 from z1_runtime.config import RuntimeConfig, ranking_of
-from z1_runtime.grasping.features import FEATURES
-from z1_runtime.grasping.ranking import Ranking, Scoring, ScoringError, ScoringHead, load_scoring, save_scoring
+from z1_runtime.grasping.ranking import (
+    FEATURES,
+    Ranking,
+    Scoring,
+    ScoringError,
+    ScoringHead,
+    load_scoring,
+    save_scoring,
+)
 
 HEAD = ScoringHead(
     features=("down", "generator"), mean=(0.1, 0.5), scale=(0.2, 0.25), coefficients=(-1.0, 2.0), intercept=0.5

@@ -20,12 +20,10 @@ from tests.support.tabletop_scene import (
     noisy_frame,
     truth,
 )
-from z1_runtime.perception.detector import mask_box
+from z1_runtime.perception.detector import NoTableError, PerceptionError, make_detector, mask_box
 from z1_runtime.perception.detectors import yolo as yolo_detector
-from z1_runtime.perception.detectors.factory import make_detector
 from z1_runtime.perception.detectors.ground_truth import GroundTruthDetector
 from z1_runtime.perception.detectors.tabletop import TabletopDetector
-from z1_runtime.perception.errors import NoTableError, PerceptionError
 
 BOTTLE = Cylinder(0.5, 0.0, 0.0325, 0.2)
 

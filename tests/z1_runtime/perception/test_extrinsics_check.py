@@ -16,7 +16,7 @@ from sim_twin.model.scene import SceneConfig
 from tests.support.errors import raises
 from z1_runtime.config import RuntimeConfig
 from z1_runtime.factory import make_grasp_selector
-from z1_runtime.perception.extrinsics_check import ExtrinsicsCheck
+from z1_runtime.perception.extrinsics import ExtrinsicsCheck
 from z1_runtime.perception.self_filter import SelfFilter
 
 AHEAD = np.array([[0.0, 0.0, 0.4]])

@@ -6,7 +6,7 @@ import pytest
 from models.types import Detection
 from tests.support.tabletop_scene import Box, Cylinder, noisy_frame, truth
 from z1_runtime.perception.detector import mask_box
-from z1_runtime.perception.mask_refinement import is_flat
+from z1_runtime.perception.detectors.yolo import is_flat
 
 BOTTLE = Cylinder(0.5, 0.0, 0.0325, 0.2)
 THINGS = [

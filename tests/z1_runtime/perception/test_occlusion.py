@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hal.base.messages import Intrinsics
-from z1_runtime.perception.occlusion import REACH_M, occluded_points
+from z1_runtime.perception.self_filter import REACH_M, occluded_points
 
 INTRINSICS = Intrinsics(width=320, height=240, fx=400.0, fy=400.0, cx=159.5, cy=119.5)
 OBJECT_M, TABLE_M = 0.30, 0.45

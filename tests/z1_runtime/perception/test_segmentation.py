@@ -10,13 +10,11 @@ from hal.base.transforms import inverse, transform_points
 from models.types import Detection
 from tests.support.errors import raises
 from tests.support.tabletop_scene import INTRINSICS, Box, Cylinder, T_base_camera, cast, frame_of, noisy_frame, truth
-from z1_runtime.perception.config import PerceptionConfig
-from z1_runtime.perception.detector import mask_box
+from z1_runtime.perception.detector import NoDepthError, NoDetectionError, PerceptionError, SmallCloudError, mask_box
 from z1_runtime.perception.detectors.ground_truth import GroundTruthDetector
 from z1_runtime.perception.detectors.tabletop import TabletopDetector
-from z1_runtime.perception.errors import NoDepthError, NoDetectionError, PerceptionError, SmallCloudError
 from z1_runtime.perception.point_cloud import back_project
-from z1_runtime.perception.segmentation import Perception
+from z1_runtime.perception.segmentation import Perception, PerceptionConfig
 
 BOTTLE = Cylinder(0.5, 0.05, 0.0325, 0.2)
 BOX = Box(0.45, -0.05, (0.06, 0.1, 0.18), 0.4)

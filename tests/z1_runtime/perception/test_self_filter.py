@@ -18,11 +18,10 @@ from tests.support.tabletop_scene import (
     frame_of,
     gripper_depth,
 )
-from z1_runtime.perception.config import PerceptionConfig
+from z1_runtime.perception.detector import NoDetectionError
 from z1_runtime.perception.detectors.tabletop import TabletopDetector
-from z1_runtime.perception.errors import NoDetectionError
 from z1_runtime.perception.point_cloud import back_project
-from z1_runtime.perception.segmentation import Perception
+from z1_runtime.perception.segmentation import Perception, PerceptionConfig
 from z1_runtime.perception.self_filter import SelfFilter
 
 JAW = -1.0

@@ -7,7 +7,7 @@ from hal.base.errors import InvalidValueError
 from hal.base.transforms import transform_points
 from tests.support.errors import raises
 from tests.support.tabletop_scene import INTRINSICS, Box, T_base_camera, cast, d405
-from z1_runtime.perception.errors import NoTableError
+from z1_runtime.perception.detector import NoTableError
 from z1_runtime.perception.point_cloud import back_project, valid_pixels
 from z1_runtime.perception.table_plane import TableConfig, TableFit, expected_table, fit_table
 from z1_runtime.types import Plane

@@ -16,8 +16,8 @@ from z1_runtime.collision.scene_collision import CollisionChecker
 from z1_runtime.geometry.kinematics import Kinematics
 from z1_runtime.grasping.beak_gripper import BeakGripper, GripperPlacement, WidthError
 from z1_runtime.motion.limits import MotionLimits
+from z1_runtime.planning.config import PlannerConfig
 from z1_runtime.planning.pick_motion import PickMotion, PickMotionPlanner
-from z1_runtime.planning.planner_config import PlannerConfig
 from z1_runtime.types import PlanningStage, Rejection, RejectionReason
 
 KINEMATICS, GRIPPER = Kinematics(), BeakGripper()

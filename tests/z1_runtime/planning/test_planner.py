@@ -25,8 +25,8 @@ from tests.support.tabletop_scenes import (
     wall,
 )
 from z1_runtime.geometry.kinematics import Kinematics
+from z1_runtime.planning.config import PlannerConfig
 from z1_runtime.planning.planner import GraspPlanner, NoPlanError
-from z1_runtime.planning.planner_config import PlannerConfig
 from z1_runtime.types import GraspPlan, Observation, PlanningStage, RejectionReason
 
 PLACES = [(x, y) for x in (0.40, 0.48, 0.56) for y in (-0.15, 0.0, 0.15)]

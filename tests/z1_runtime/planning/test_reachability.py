@@ -21,11 +21,10 @@ from tests.support.tabletop_scenes import (
     make_observation,
 )
 from z1_runtime.geometry.kinematics import Kinematics
-from z1_runtime.grasping.features import fit_upright_box
+from z1_runtime.grasping.ranking import fit_upright_box
+from z1_runtime.planning.config import PlannerConfig, ReachabilityConfig
 from z1_runtime.planning.planner import GraspPlanner
-from z1_runtime.planning.planner_config import PlannerConfig
 from z1_runtime.planning.reachability import ReachabilityRanker
-from z1_runtime.planning.reachability_config import ReachabilityConfig
 from z1_runtime.types import Observation
 
 AT = (0.48, 0.0)

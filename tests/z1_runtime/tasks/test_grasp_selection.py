@@ -17,9 +17,9 @@ from tests.support.errors import raises
 from tests.support.tabletop_scene import frame_of
 from z1_runtime.config import RuntimeConfig
 from z1_runtime.factory import make_grasp_selector
-from z1_runtime.perception import extrinsics_check
+from z1_runtime.perception import extrinsics
+from z1_runtime.perception.detector import NoDepthError, NoDetectionError, PerceptionError
 from z1_runtime.perception.detectors.ground_truth import GroundTruthDetector
-from z1_runtime.perception.errors import NoDepthError, NoDetectionError, PerceptionError
 from z1_runtime.planning.planner import NoPlanError
 from z1_runtime.tasks.grasp_selection import GraspSelector, StageTimes
 from z1_runtime.tasks.warm_up import draw_can, warm_up_selector
@@ -183,9 +183,9 @@ def test_warming_up_needs_no_camera_with_any_detector(detector, caplog):
 
 
 def test_warming_up_reads_the_jaws_meshes_though_no_jaws_are_drawn(selector):
-    extrinsics_check._sample_mesh.cache_clear()
+    extrinsics._sample_mesh.cache_clear()
     warm_up_selector(selector)
-    assert extrinsics_check._sample_mesh.cache_info().currsize == 2
+    assert extrinsics._sample_mesh.cache_info().currsize == 2
 
 
 def test_a_warm_up_scene_without_a_plan_is_logged_and_a_real_one_is_an_error(T_base_camera, caplog):

@@ -18,7 +18,7 @@ from tests.support.tabletop_scene import frame_of
 from z1_runtime.config import RuntimeConfig
 from z1_runtime.factory import make_grasp_selector
 from z1_runtime.motion.executor import MotionError
-from z1_runtime.perception.errors import NoDepthError, NoDetectionError
+from z1_runtime.perception.detector import NoDepthError, NoDetectionError
 from z1_runtime.tasks.grasp_selection import GraspSelector
 from z1_runtime.tasks.pick import PickTask
 from z1_runtime.tasks.warm_up import draw_can

@@ -6,8 +6,7 @@ import numpy as np
 
 from hal.base.messages import RgbdFrame
 from models.types import Detection
-from z1_runtime.perception.detector import mask_box
-from z1_runtime.perception.errors import PerceptionError
+from z1_runtime.perception.detector import PerceptionError, mask_box
 
 
 class GroundTruthDetector:

@@ -10,8 +10,7 @@ from models.diffusion.training.labels import check_grasps, find_grasps
 from models.diffusion.training.shapes import make_shape
 from models.diffusion.training.solids import BOX, make_part, make_solid
 from tests.support.errors import raises
-from z1_runtime.geometry.gripper_geometry import GripperPlacementConfig
-from z1_runtime.geometry.gripper_mesh import gripper_shape
+from z1_runtime.geometry.gripper_geometry import GripperPlacementConfig, gripper_shape
 from z1_runtime.grasping.beak_gripper import BeakGripper
 
 GRIPPER = GRIPPERS["z1"]

@@ -11,7 +11,7 @@ from sim_twin.benchmark.episodes.scenarios import Scenario
 from sim_twin.model.scene import SceneConfig
 from z1_runtime.config import RuntimeConfig
 from z1_runtime.factory import make_grasp_selector
-from z1_runtime.grasping.features import FEATURES
+from z1_runtime.grasping.ranking import FEATURES
 
 CONFIG = RuntimeConfig(generator="antipodal", detector="tabletop", n_candidates=400)
 SCENARIO = Scenario(object="cylinder", distance="mid", lateral="centre", pitch_deg=0.0)

@@ -9,8 +9,7 @@ from sim_twin.benchmark.tuning.logged_episodes import Samples, extract_samples
 from sim_twin.benchmark.tuning.thresholds import fit_threshold
 from sim_twin.benchmark.tuning.variants import find_variants, format_ranking, select_variant
 from tests.support.tune_episodes import episode, scenarios
-from z1_runtime.grasping.features import FEATURES
-from z1_runtime.grasping.ranking import Ranking
+from z1_runtime.grasping.ranking import FEATURES, Ranking
 
 pytest.importorskip("sklearn", reason="uv sync --inexact --extra tune")
 POSES = np.array([f"pose{n // 2}" for n in range(120)])

@@ -13,8 +13,7 @@ from sim_twin.benchmark.results.store import Store
 from tests.support.errors import raises
 from z1_runtime.config import RuntimeConfig
 from z1_runtime.factory import make_grasp_selector
-from z1_runtime.grasping.features import measure_features
-from z1_runtime.grasping.ranking import Ranking, Scoring, ScoringError, ScoringHead, save_scoring
+from z1_runtime.grasping.ranking import Ranking, Scoring, ScoringError, ScoringHead, measure_features, save_scoring
 from z1_runtime.tasks.grasp_selection import StageTimes
 from z1_runtime.tasks.warm_up import draw_can
 

@@ -10,8 +10,7 @@ from sim_twin.benchmark.tuning.logged_episodes import TuneError, load_logs
 from sim_twin.benchmark.tuning.report import write_tuning_report
 from tests.support.errors import raises
 from tests.support.tune_episodes import episode, number_of, scenarios, write_run
-from z1_runtime.grasping.features import FEATURES
-from z1_runtime.grasping.ranking import load_scoring, save_scoring
+from z1_runtime.grasping.ranking import FEATURES, load_scoring, save_scoring
 
 pytest.importorskip("sklearn", reason="uv sync --inexact --extra tune")
 
