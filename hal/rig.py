@@ -1,18 +1,20 @@
-"""Rig: one set of connected devices, an arm, a camera, and their clock; and the registry of backends."""
+"""Rig: the devices of one robot, by name from the registry of backends, and connected under a servo or over the bus."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
-from hal.base.arm import Arm
-from hal.base.camera import Camera
-from hal.base.clock import Clock
+from hal.base.clock import Clock, WallClock
 from hal.base.errors import InvalidValueError, UnknownBackendError
 
 if TYPE_CHECKING:
+    from hal.base.arm import Arm, ServoedArm
+    from hal.base.camera import Camera
+    from hal.bus.session import BusConfig
     from hal.parking import Parking
 
 
@@ -101,3 +103,67 @@ RIGS: Registry[Rig] = Registry(
         "wire-sim": "sim_twin.drop_in.rig:make_wire_sim_rig",
     },
 )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Devices:
+    """A servoed arm, a camera, and the clock of both, all connected."""
+
+    arm: ServoedArm
+    camera: Camera
+    clock: Clock
+    real_time: bool = True
+    """False in lock-step, where time moves only while a caller sleeps on the clock."""
+    world: Any = None
+    """The simulated world of a rig in this process, for evaluation only."""
+
+
+@contextmanager
+def connect_rig(rig: Rig, *, camera: bool = True) -> Iterator[Devices]:
+    """Yield the devices of `rig` under a servo with the default workspace guard; its lease is free.
+
+    In lock-step the same calls give the same bytes; otherwise a thread of this process ticks the servo.
+
+    Args:
+        rig: not connected yet.
+        camera: False leaves its connection to the caller, as a connected one holds a renderer.
+    """
+    from hal.servo.guard import Guard
+    from hal.servo.servo import Servo
+
+    servo = Servo(rig.arm, rig.clock, guard=Guard())
+    with ExitStack() as stack:
+        servo.connect()
+        stack.callback(servo.disconnect)
+        if camera:
+            rig.camera.connect()
+        stack.callback(rig.camera.disconnect)
+        if rig.call_every_tick is not None:
+            rig.call_every_tick(servo.tick)
+        else:
+            from hal.servo.servo_thread import ServoThread
+
+            stack.enter_context(ServoThread(servo, rig.clock))
+        yield Devices(
+            arm=servo,
+            camera=rig.camera,
+            clock=rig.clock,
+            real_time=rig.call_every_tick is None,
+            world=rig.world,
+        )
+
+
+@contextmanager
+def connect_remote(bus: BusConfig, owner: str) -> Iterator[Devices]:
+    """Yield the devices of the HAL process at `bus`; its lease is free until `owner` claims it.
+
+    Raises:
+        HalTimeoutError: no HAL process answers.
+    """
+    from hal.bus.client import RemoteArm
+    from hal.bus.remote_camera import RemoteCamera
+
+    clock = WallClock()
+    # Disconnecting releases the lease, also after the HAL process has ended.
+    with RemoteArm(bus, owner, clock) as arm, RemoteCamera(bus, clock) as camera:
+        yield Devices(arm=arm, camera=camera, clock=clock)

@@ -26,8 +26,8 @@ from hal.base.messages import ArmSetpoint, ArmState, Intrinsics, RgbdFrame
 from hal.base.z1 import CONTROL_PERIOD_S
 from hal.rig import Rig
 from sim_twin.camera import d405
+from sim_twin.camera.d405 import View, WristRenderer
 from sim_twin.camera.render import make_renderer
-from sim_twin.camera.wrist_view import View, WristRenderer
 from sim_twin.model.scene import SceneConfig
 from sim_twin.model.world import World
 

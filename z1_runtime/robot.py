@@ -12,14 +12,11 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from hal.base import z1
-from hal.base.arm import ServoedArm
-from hal.base.camera import Camera
 from hal.base.clock import Clock
 from hal.base.errors import GuardError, InvalidValueError
 from hal.base.messages import ArmState, RgbdFrame
-from hal.rig import RIGS
+from hal.rig import RIGS, Devices, connect_remote, connect_rig
 from z1_runtime.config import RuntimeConfig
-from z1_runtime.devices import Devices, connect_remote, connect_rig
 from z1_runtime.motion.executor import Executor
 from z1_runtime.motion.limits import MotionLimits
 from z1_runtime.motion.trajectory import joint_move
@@ -27,6 +24,8 @@ from z1_runtime.perception.extrinsics import Extrinsics, find_extrinsics
 from z1_runtime.visualization.rerun_logger import RerunLogger
 
 if TYPE_CHECKING:  # detector, generator and planner take seconds to load, and only a pick needs them
+    from hal.base.arm import ServoedArm
+    from hal.base.camera import Camera
     from hal.bus.session import BusConfig
     from hal.servo.guard import Guard
     from models.types import GraspGenerator
@@ -40,7 +39,7 @@ class Robot:
     """An arm with a wrist camera; use it in a `with` block, or call `close`.
 
     Args:
-        devices: of `z1_runtime.devices`; entered here and left by `close`.
+        devices: of `hal.rig`; entered here and left by `close`.
         config: settings; None = the defaults.
         extrinsics: camera pose on the flange; None = looked up by the serial number of the first frame.
         calibration: hand-eye result for that look-up; None = the newest of this camera, else the mount's drawing.
@@ -296,8 +295,7 @@ class Robot:
 
     def _load_selector(self, config: RuntimeConfig) -> GraspSelector:
         """Return the selector for `config`, which differs from `self.config` in class and attempts only."""
-        from z1_runtime.factory import check_object_class, make_grasp_selector
-        from z1_runtime.tasks.warm_up import warm_up_selector
+        from z1_runtime.factory import check_object_class, make_grasp_selector, warm_up_selector
 
         if self._selector is None:
             self._selector = make_grasp_selector(

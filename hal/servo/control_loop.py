@@ -10,9 +10,10 @@ Nothing in it blocks, logs or takes a lock. The motions themselves are in `setpo
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
-from hal.base.arm import Arm
 from hal.base.errors import HalError
 from hal.base.messages import ArmSetpoint, ArmState, ServoMode
 from hal.base.z1 import N_ARM
@@ -20,6 +21,9 @@ from hal.servo.command_mailbox import CommandMailbox, Snapshot
 from hal.servo.limits import OverloadDetector, ServoLimits, clip_setpoint, compute_servo_torque, find_blocked
 from hal.servo.setpoint_generator import JointCommand, SetpointGenerator
 from hal.servo.trajectory_buffer import TrajectoryBuffer
+
+if TYPE_CHECKING:
+    from hal.base.arm import Arm
 
 
 class ControlCycle:

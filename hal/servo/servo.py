@@ -11,7 +11,8 @@ mailbox's immutable entries, and publishes one immutable snapshot.
 
 from __future__ import annotations
 
-from hal.base.arm import Arm
+from typing import TYPE_CHECKING
+
 from hal.base.clock import Clock
 from hal.base.errors import CommandRejectedError, HalError, HalTimeoutError, NotConnectedError
 from hal.base.messages import ArmSetpoint, ArmState, ServoHealth, ServoMode, ServoStatus, TrajectoryChunk
@@ -20,6 +21,9 @@ from hal.servo.control_loop import ControlCycle
 from hal.servo.guard import Guard
 from hal.servo.limits import ServoLimits, clip_setpoint
 from hal.servo.status import PeriodStatistics, StatusLogger, make_health, make_status
+
+if TYPE_CHECKING:
+    from hal.base.arm import Arm
 
 _STATE_MAX_AGE_S = 0.2  # 100 ticks; `BusConfig.state_max_age_s` is the same for clients
 

@@ -114,13 +114,11 @@ def _start_hal(config: Config, stack: ExitStack) -> HalProcess:
 
 def _open_robot(config: Config, process: HalProcess | None, console: Console) -> Robot:
     """Return the connected robot, with detector, generator and planner loaded while the HAL process starts."""
-    from hal.rig import RIGS
+    from hal.rig import RIGS, connect_remote, connect_rig
     from z1_runtime.config import save_config
-    from z1_runtime.devices import connect_remote, connect_rig
-    from z1_runtime.factory import make_grasp_selector
+    from z1_runtime.factory import make_grasp_selector, warm_up_selector
     from z1_runtime.perception.extrinsics import find_extrinsics
     from z1_runtime.robot import Robot
-    from z1_runtime.tasks.warm_up import warm_up_selector
 
     runtime = _runtime_config(config)
     save_config(runtime, config.out / "config.yaml")

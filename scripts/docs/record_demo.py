@@ -18,6 +18,7 @@ import tyro
 from PIL import Image
 
 from hal.base import z1
+from hal.rig import Devices, connect_rig
 from scripts.docs.wrist_overlay import Layers, draw_caption, draw_mask, draw_overlay
 from sim_twin.backends import TwinClock, make_rig
 from sim_twin.camera import d405
@@ -25,11 +26,9 @@ from sim_twin.camera.external_view import render_external
 from sim_twin.camera.render import make_renderer
 from sim_twin.model.scene import SceneConfig, build_model
 from z1_runtime.config import load_config
-from z1_runtime.devices import Devices, connect_rig
-from z1_runtime.factory import make_grasp_selector
+from z1_runtime.factory import make_grasp_selector, warm_up_selector
 from z1_runtime.geometry.kinematics import Kinematics
 from z1_runtime.tasks.pick import PickResult, PickTask
-from z1_runtime.tasks.warm_up import warm_up_selector
 from z1_runtime.visualization.rerun_logger import RerunLogger
 
 _SIZE = (480, 360)

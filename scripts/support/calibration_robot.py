@@ -16,8 +16,8 @@ from hal.base.camera import Camera
 from hal.base.clock import Clock
 from hal.base.errors import HalTimeoutError
 from hal.bus.session import BusConfig
+from hal.rig import connect_remote, connect_rig
 from scripts.support.scene_options import MountErrorOptions
-from z1_runtime.devices import connect_remote, connect_rig
 
 if TYPE_CHECKING:
     from sim_twin.ground_truth import GroundTruth

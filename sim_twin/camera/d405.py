@@ -1,14 +1,54 @@
-"""The twin's RealSense D405: intrinsics, and the stereo noise of an exact depth image.
+"""The twin's RealSense D405: an exact image, its intrinsics, and the stereo noise that it adds.
 
 Sources: Intel's datasheet and depth-quality tables, and figures measured on real units.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Protocol
+
+import mujoco
 import numba
 import numpy as np
 
 from hal.base.messages import Intrinsics
+from sim_twin.model.objects import OBJECT_BODY
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class View:
+    """One exact image."""
+
+    colour: np.ndarray
+    """(H, W, 3) uint8, RGB."""
+    z_m: np.ndarray
+    """(H, W) float32 distance along the optical axis [m]; 0 where nothing is hit."""
+    mask: np.ndarray
+    """(H, W) bool, the object's pixels."""
+
+
+class WristRenderer(Protocol):
+    """Draws for the wrist camera; belongs to the thread that made it."""
+
+    def render(self, data: mujoco.MjData) -> View:
+        """Draw the state `data` (kinematics computed)."""
+        ...
+
+    def close(self) -> None:
+        """Free what the renderer holds."""
+        ...
+
+
+def camera_id(model: mujoco.MjModel) -> int:
+    """Return the number of the wrist camera."""
+    return model.camera("wrist").id
+
+
+def object_geoms(model: mujoco.MjModel) -> np.ndarray:
+    """Return which geoms (ngeom,) bool are the object's."""
+    return model.geom_bodyid == model.body(OBJECT_BODY).id
+
 
 INTRINSICS = Intrinsics(width=640, height=480, fx=393.0305, fy=392.6793, cx=312.918, cy=240.937)
 """The colour stream of a real unit at 640×480, taken as undistorted."""

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from hal.base.messages import Intrinsics
-from sim_twin.camera.wrist_view import View, camera_id, object_geoms
+from sim_twin.camera.d405 import View, camera_id, object_geoms
 from sim_twin.model.charuco_board import PRINT_GEOM, BoardSpec, project_print
 from sim_twin.model.z1_mjcf import GROUP_ARM, GROUP_SCENE
 

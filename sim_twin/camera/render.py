@@ -17,7 +17,7 @@ import numpy as np
 
 from hal.base.errors import CameraError, InvalidValueError
 from hal.base.messages import Intrinsics
-from sim_twin.camera.wrist_view import View, WristRenderer, camera_id, object_geoms
+from sim_twin.camera.d405 import View, WristRenderer, camera_id, object_geoms
 from sim_twin.model.z1_mjcf import GROUP_ARM, GROUP_SCENE
 
 if TYPE_CHECKING:  # few scenes have a board

@@ -14,8 +14,8 @@ from hal.base.d405 import BASELINE_M, DEPTH_UNIT_M, MIN_Z_M, CaptureRequest, D40
 from hal.base.messages import Intrinsics
 from sim_twin.backends import TwinClock, lower_thread_priority
 from sim_twin.camera import d405
+from sim_twin.camera.d405 import View, WristRenderer, camera_id
 from sim_twin.camera.render import make_renderer
-from sim_twin.camera.wrist_view import View, WristRenderer, camera_id
 from sim_twin.model.world import SceneView, World
 
 

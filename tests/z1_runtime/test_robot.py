@@ -18,7 +18,7 @@ from hal.base.errors import GuardError, InvalidValueError, StoppedError
 from hal.base.messages import ServoMode
 from hal.bus.server import HalServer
 from hal.bus.session import BusConfig
-from hal.rig import Rig
+from hal.rig import Devices, Rig, connect_rig
 from hal.servo.servo import Servo
 from hal.servo.servo_thread import ServoThread
 from models.samplers.antipodal import AntipodalSampler
@@ -28,7 +28,6 @@ from tests.support.lockstep import TickingClock
 from tests.support.ports import free_tcp_port
 from z1_runtime import Robot
 from z1_runtime.config import RuntimeConfig
-from z1_runtime.devices import Devices, connect_rig
 from z1_runtime.geometry.kinematics import IkFailure, Kinematics
 from z1_runtime.perception.detectors.ground_truth import GroundTruthDetector
 

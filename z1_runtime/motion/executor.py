@@ -5,15 +5,18 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from hal.base import z1
-from hal.base.arm import ServoedArm
 from hal.base.clock import Clock
 from hal.base.errors import InvalidValueError, Z1Error
 from hal.base.messages import ArmState, ServoStatus, TrajectoryChunk
 from z1_runtime.types import JointTrajectory
+
+if TYPE_CHECKING:
+    from hal.base.arm import ServoedArm
 
 _QUIET_POLLS = 3  # in a row: a joint that turns back is at rest for one
 

@@ -7,12 +7,11 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from hal.base import z1
-from hal.base.arm import ServoedArm
-from hal.base.camera import Camera
 from hal.base.clock import Clock
 from hal.base.messages import ArmState
 from models.obb.obb import DegenerateCloudError
@@ -24,6 +23,10 @@ from z1_runtime.planning.planner import NoPlanError
 from z1_runtime.tasks.grasp_selection import GraspSelection, GraspSelector
 from z1_runtime.types import GraspPlan
 from z1_runtime.visualization.rerun_logger import RerunLogger
+
+if TYPE_CHECKING:
+    from hal.base.arm import ServoedArm
+    from hal.base.camera import Camera
 
 _LOG = logging.getLogger(__name__)
 

@@ -151,8 +151,7 @@ def make_grasp_selector(config: RuntimeConfig, scenario: Scenario, seed: int) ->
 
 @cache
 def _assembled(config: RuntimeConfig) -> GraspSelector:
-    from z1_runtime.factory import make_grasp_selector
-    from z1_runtime.tasks.warm_up import warm_up_selector
+    from z1_runtime.factory import make_grasp_selector, warm_up_selector
 
     selector = make_grasp_selector(config)
     warm_up_selector(selector)

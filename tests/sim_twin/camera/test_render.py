@@ -4,9 +4,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from sim_twin.camera.d405 import INTRINSICS, MIN_Z_M, measure_depth
+from sim_twin.camera.d405 import INTRINSICS, MIN_Z_M, View, measure_depth
 from sim_twin.camera.render import make_renderer
-from sim_twin.camera.wrist_view import View
 from sim_twin.model.objects import PAPER_OBJECTS
 from sim_twin.model.scene import SceneConfig
 from sim_twin.model.world import World

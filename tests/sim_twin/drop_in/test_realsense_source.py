@@ -14,8 +14,8 @@ from hal.backends.d405.session import D405CameraConfig
 from hal.base.clock import WallClock
 from hal.base.d405 import BASELINE_M, DEPTH_UNIT_M, MIN_Z_M, CaptureRequest, Exposure
 from hal.base.messages import Intrinsics
+from sim_twin.camera.d405 import View
 from sim_twin.camera.render import make_renderer
-from sim_twin.camera.wrist_view import View
 from sim_twin.drop_in.realsense_source import Optics, TwinSource
 from sim_twin.model.charuco_board import BoardSpec
 from sim_twin.model.scene import SceneConfig

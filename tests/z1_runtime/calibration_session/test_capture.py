@@ -16,13 +16,13 @@ from calibration.samples import load_samples
 from hal.base import z1
 from hal.base.messages import ArmState, RgbdFrame
 from hal.base.transforms import pose_error
+from hal.rig import connect_rig
 from scripts.support.calibration_robot import CalibrationRobot, RobotOptions, open_robot
 from sim_twin.backends import make_rig
 from sim_twin.model.scene import SceneConfig
 from tests.support.errors import raises
 from z1_runtime.calibration_session.board_search import BoardSearch, capture_still_frame
 from z1_runtime.calibration_session.capture import Key, SampleCapture
-from z1_runtime.devices import connect_rig
 from z1_runtime.geometry.kinematics import Kinematics
 from z1_runtime.motion.executor import Executor, MotionError
 from z1_runtime.motion.trajectory import MotionLimits, joint_move

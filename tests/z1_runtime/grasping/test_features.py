@@ -21,7 +21,7 @@ from tests.support.tabletop_scenes import (
     make_observation,
 )
 from z1_runtime.config import RuntimeConfig
-from z1_runtime.factory import make_grasp_selector
+from z1_runtime.factory import draw_can, make_grasp_selector
 from z1_runtime.geometry.kinematics import Kinematics
 from z1_runtime.grasping.ranking import (
     FEATURES,
@@ -36,7 +36,6 @@ from z1_runtime.grasping.ranking import (
 from z1_runtime.planning.config import PlannerConfig
 from z1_runtime.planning.reachability import ReachabilityRanker
 from z1_runtime.tasks.grasp_selection import GraspSelector
-from z1_runtime.tasks.warm_up import draw_can
 from z1_runtime.types import Observation
 
 AT = (0.46, 0.08)

@@ -16,13 +16,12 @@ from models.types import GraspSet
 from tests.support.errors import raises
 from tests.support.tabletop_scene import frame_of
 from z1_runtime.config import RuntimeConfig
-from z1_runtime.factory import make_grasp_selector
+from z1_runtime.factory import draw_can, make_grasp_selector, warm_up_selector
 from z1_runtime.perception import extrinsics
 from z1_runtime.perception.detector import NoDepthError, NoDetectionError, PerceptionError
 from z1_runtime.perception.detectors.ground_truth import GroundTruthDetector
 from z1_runtime.planning.planner import NoPlanError
 from z1_runtime.tasks.grasp_selection import GraspSelector, StageTimes
-from z1_runtime.tasks.warm_up import draw_can, warm_up_selector
 
 Q = np.append(z1.Q_HOME, -1.0)
 CONFIG = RuntimeConfig(detector="tabletop", generator="antipodal", n_candidates=300)
@@ -177,7 +176,7 @@ def test_candidates_that_all_come_from_behind_leave_no_plan(selector, selection,
 
 @pytest.mark.parametrize("detector", ["yolo", "tabletop", "ground_truth"])
 def test_warming_up_needs_no_camera_with_any_detector(detector, caplog):
-    with caplog.at_level("INFO", "z1_runtime.tasks.warm_up"):
+    with caplog.at_level("INFO", "z1_runtime.factory"):
         warm_up_selector(make_grasp_selector(replace(RuntimeConfig(), detector=detector)))
     assert not caplog.records
 
@@ -191,7 +190,7 @@ def test_warming_up_reads_the_jaws_meshes_though_no_jaws_are_drawn(selector):
 def test_a_warm_up_scene_without_a_plan_is_logged_and_a_real_one_is_an_error(T_base_camera, caplog):
     config = RuntimeConfig(detector="tabletop", generator="antipodal")
     high = make_grasp_selector(replace(config, planner=replace(config.planner, lift_m=0.5)))
-    with caplog.at_level("INFO", "z1_runtime.tasks.warm_up"):
+    with caplog.at_level("INFO", "z1_runtime.factory"):
         warm_up_selector(high)
     assert "no plan" in caplog.text
     with raises(NoPlanError, "no_plan"):

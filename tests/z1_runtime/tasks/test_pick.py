@@ -16,12 +16,11 @@ from tests.support.errors import raises
 from tests.support.lockstep import Bench
 from tests.support.tabletop_scene import frame_of
 from z1_runtime.config import RuntimeConfig
-from z1_runtime.factory import make_grasp_selector
+from z1_runtime.factory import draw_can, make_grasp_selector
 from z1_runtime.motion.executor import MotionError
 from z1_runtime.perception.detector import NoDepthError, NoDetectionError
 from z1_runtime.tasks.grasp_selection import GraspSelector
 from z1_runtime.tasks.pick import PickTask
-from z1_runtime.tasks.warm_up import draw_can
 from z1_runtime.visualization.rerun_logger import RerunLogger
 
 CONFIG = RuntimeConfig(detector="tabletop", generator="antipodal", n_candidates=300, hold_s=0.2, frame_timeout_s=0.5)

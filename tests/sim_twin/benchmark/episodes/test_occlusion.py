@@ -3,8 +3,8 @@ import pytest
 
 from hal.base import z1
 from sim_twin.benchmark.episodes.occlusion import occlude
+from z1_runtime.factory import draw_can
 from z1_runtime.geometry.kinematics import Kinematics
-from z1_runtime.tasks.warm_up import draw_can
 
 
 @pytest.fixture(scope="module")

@@ -12,10 +12,9 @@ from sim_twin.benchmark.episodes.shared_observation import SharedObservation
 from sim_twin.benchmark.results.store import Store
 from tests.support.errors import raises
 from z1_runtime.config import RuntimeConfig
-from z1_runtime.factory import make_grasp_selector
+from z1_runtime.factory import draw_can, make_grasp_selector
 from z1_runtime.grasping.ranking import Ranking, Scoring, ScoringError, ScoringHead, measure_features, save_scoring
 from z1_runtime.tasks.grasp_selection import StageTimes
-from z1_runtime.tasks.warm_up import draw_can
 
 HEAD = ScoringHead(features=("above_m",), mean=(0.0,), scale=(0.01,), coefficients=(1.0,), intercept=0.0)
 Q = np.append(z1.Q_HOME, -1.0)
