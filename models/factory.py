@@ -39,7 +39,8 @@ class GeneratorOptions:
     def __post_init__(self) -> None:
         if self.process not in get_args(Process):
             raise InvalidValueError(
-                f"generator_process is {self.process!r}; allowed is in (this process) or own.", code="generator_process"
+                f"generator_options: process is {self.process!r}; allowed is in (this process) or own.",
+                code="generator_process",
             )
 
 

@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 
 from hal.base.errors import InvalidValueError, Z1Error
-from hal.base.files import atomic_path
 
 WEIGHTS_FOLDER = Path(__file__).resolve().parent / "weights"
 
@@ -33,6 +32,8 @@ def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> str:
     """
     if path.suffix != ".npz":
         raise InvalidValueError(f"{path} must end in .npz: weights are kept as NumPy arrays.", code="weights_suffix")
+    from hal.base.files import atomic_path  # needs yaml, which an environment of a generator's own lacks
+
     with atomic_path(path) as partial:
         with partial.open("wb") as file:
             np.savez(file, allow_pickle=False, **arrays)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ast
+import subprocess
+import sys
 from collections.abc import Iterator
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
@@ -23,6 +25,8 @@ ALLOWED: dict[str, set[str]] = {
 """Package to what it may import; the longest matching package counts."""
 MAX_FILES = 16
 """Modules in a folder, `__init__` not counted; more than that is a folder that was not made."""
+MAX_LOADED = 70
+"""Modules that a lock-step pick loads, the twin's and the detector's included, `__init__` not counted."""
 TIMELESS_ROOMS = ("hal", "z1_runtime", "models", "sim_twin", "calibration")
 MAY_READ_THE_TIME = ("hal/base/clock.py",)
 READS_THE_TIME = {
@@ -212,6 +216,26 @@ def test_a_cycle_between_folders_would_be_found() -> None:
     }
     assert cycles(module_graph(files)) == []
     assert len(cycles(folder_graph(module_graph(files)))) == 1
+
+
+LIST_LOADED = """
+import sys
+from z1_runtime import Robot
+
+with Robot.simulate("bottle") as robot:
+    assert robot.pick().held
+print(*sorted(name for name in sys.modules if getattr(sys.modules[name], "__file__", None)), sep="\\n")
+"""
+
+
+@pytest.mark.integration
+def test_a_lock_step_pick_loads_few_modules() -> None:
+    loaded = subprocess.run(
+        [sys.executable, "-c", LIST_LOADED], cwd=ROOT, capture_output=True, text=True, check=True
+    ).stdout.split()
+    paths = [ROOT / (name.replace(".", "/") + ".py") for name in loaded if name.split(".")[0] in ROOMS]
+    ours = [name_of(path) for path in paths if path.is_file()]
+    assert 50 < len(ours) <= MAX_LOADED, ours
 
 
 def test_the_benchmark_alone_may_join_the_twin_and_the_runtime() -> None:

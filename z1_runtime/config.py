@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import yaml
 
 from hal.base.errors import InvalidValueError
-from models.detector.runtimes import RUNTIMES
-from models.factory import Process, generator_for, split_generator_name
+from models.detector.detector import YoloConfig
+from models.factory import GeneratorOptions, generator_for, split_generator_name
 from z1_runtime.grasping.ranking import Ranking, load_scoring
 from z1_runtime.motion.executor import ExecutorConfig
 from z1_runtime.perception.detector import DETECTORS
@@ -26,26 +26,16 @@ class RuntimeConfig:
     detector: str = "yolo"
     """Detector: `yolo` (the learned one that ships: bottles, boxes and cylinders), `tabletop` (whatever rises
     above the table, no learning), or `ground_truth` (the twin's mask, for evaluation)."""
-    detector_weights: str = ""
-    """Weights of `yolo`: .npz of ours, .pt of ultralytics, .onnx, OpenVINO's .xml or its folder; empty = ours."""
-    detector_runtime: str = "auto"
-    """Inference runtime of `yolo`: `openvino`, `onnxruntime`, `torch`, or `auto`, the first installed one of these."""
-    detector_confidence: float = 0.5
-    """Minimum detection confidence of `yolo`, in [0, 1)."""
-    detector_mirrored: bool = True
-    """Whether `yolo` also runs on the mirror image: fewer errors for twice the time."""
-    object_class: str = ""
-    """Class to pick, for a detector with classes; empty = the most confident detection."""
+    yolo: YoloConfig = field(default_factory=YoloConfig)
+    """Weights, inference runtime and thresholds of `yolo`."""
+    object_class: str | None = None
+    """Class to pick, for a detector with classes; None = the most confident detection."""
     generator: str = "diffusion"
     """Grasp generator: `diffusion` (learned, for any parallel jaw) and `diffusion_z1` (for the Z1's gripper) ship;
     `antipodal`, `obb_sweep` (no learning), `graspgen`, `graspgenx` (NVIDIA's; weights are yours to bring), or
     `union:a+b` of any of them."""
-    generator_weights: str = ""
-    """Checkpoint of `graspgen` (.yml) or `graspgenx` (folder), or other weights (.npz) of `diffusion`; empty = ours."""
-    generator_process: Process = "in"
-    """Where `graspgen` and `graspgenx` run: `in` the runtime's process, or in their `own`."""
-    generator_python: str = ""
-    """The Python of that process; empty = that of `python -m scripts.train.make_generator_env`."""
+    generator_options: GeneratorOptions = field(default_factory=GeneratorOptions)
+    """Weights of the generator, and the process of NVIDIA's."""
     n_candidates: int = 800
     """Grasps the generator proposes (the paper's N)."""
     seed: int = 0
@@ -57,9 +47,9 @@ class RuntimeConfig:
     alpha: float = 0.85
     """Weight of the alignment against the generator's score (the paper's α), among grasps of equal value to arm
     and gripper (`planner.reachability`)."""
-    scoring: str = ""
+    scoring: Path | None = None
     """A file of `./z1 tune`, whose box, faces, weights and thresholds replace `box_method`, `k_faces`, `alpha`
-    and, if it has a head, the weights of `planner.reachability`; empty = those set here."""
+    and, if it has a head, the weights of `planner.reachability`; None = those set here."""
     speed: float = 0.5
     """Fraction of the arm's speed, acceleration and jerk limits that motions use, in (0, 1]."""
     jaw_home: float = -1.0
@@ -83,11 +73,7 @@ class RuntimeConfig:
 
     def __post_init__(self) -> None:
         _require(self.detector in DETECTORS, "detector", repr(self.detector), " or ".join(DETECTORS))
-        runtimes = ("auto", *RUNTIMES)
-        _require(self.detector_runtime in runtimes, "detector_runtime", self.detector_runtime, " or ".join(runtimes))
-        _require(0.0 <= self.detector_confidence < 1.0, "detector_confidence", self.detector_confidence, "0 to below 1")
         split_generator_name(self.generator)
-        _require(self.generator_process in get_args(Process), "generator_process", self.generator_process, "in or own")
         _require(1 <= self.n_candidates <= 20_000, "n_candidates", self.n_candidates, "1 to 20000")
         _require(
             self.box_method in ("upright", "pca", "min_volume"),
@@ -139,7 +125,7 @@ def with_detector(
         ValueError: no detector is called that.
     """
     if weights is not None:
-        config = replace(config, detector="yolo", detector_weights=str(weights))
+        config = replace(config, detector="yolo", yolo=replace(config.yolo, weights=weights))
     if detector is not None:
         config = replace(config, detector=detector)
     return config if crop is None else replace(config, perception=replace(config.perception, crop=crop))
@@ -155,7 +141,8 @@ def with_generator(config: RuntimeConfig, generator: str | None, weights: Path |
         name = generator_for(weights)
         if name in split_generator_name(config.generator):
             name = config.generator  # as it was configured, such as a union
-        config = replace(config, generator=name, generator_weights=str(weights))
+        options = replace(config.generator_options, weights=weights)
+        config = replace(config, generator=name, generator_options=options)
     return config if generator is None else replace(config, generator=generator)
 
 
@@ -165,8 +152,8 @@ def ranking_of(config: RuntimeConfig) -> Ranking:
     Raises:
         ScoringError: the file cannot be used.
     """
-    if config.scoring:
-        return load_scoring(Path(config.scoring)).full
+    if config.scoring is not None:
+        return load_scoring(config.scoring).full
     return hand_set(config)
 
 
@@ -177,7 +164,9 @@ def hand_set(config: RuntimeConfig) -> Ranking:
 
 def save_config(config: RuntimeConfig, path: Path) -> None:
     """Write `config` as YAML that `load_config` reads back to an equal one."""
-    path.write_text(yaml.safe_dump(asdict(config), sort_keys=False))
+    from hal.base.files import plain
+
+    path.write_text(yaml.safe_dump(plain(asdict(config)), sort_keys=False))
 
 
 def _require(ok: bool, name: str, seen: object, allowed: str) -> None:

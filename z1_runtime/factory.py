@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import logging
 from contextlib import suppress
-from pathlib import Path
 
 import numpy as np
 
 from hal.base import z1
 from hal.base.messages import Intrinsics, RgbdFrame
-from models.detector.detector import YoloConfig, labels_for
-from models.factory import GeneratorOptions, make_generator
+from models.detector.detector import labels_for
+from models.factory import make_generator
 from models.types import Detection, GraspGenerator
 from z1_runtime.config import RuntimeConfig
 from z1_runtime.geometry.kinematics import Kinematics
@@ -21,6 +20,12 @@ from z1_runtime.perception.extrinsics import warm_up_extrinsics_check
 from z1_runtime.perception.segmentation import Perception
 from z1_runtime.planning.planner import GraspPlanner, NoPlanError
 from z1_runtime.tasks.grasp_selection import GraspSelector
+
+_LOG = logging.getLogger(__name__)
+
+_CAN_X_M = 0.48  # middle of the range in which an object is put before the arm, 0.40 to 0.56 m
+_MAX_DEPTH_M = 1.5
+_INTRINSICS = Intrinsics(width=640, height=480, fx=393.0, fy=393.0, cx=319.5, cy=239.5)
 
 
 def make_grasp_selector(
@@ -42,12 +47,12 @@ def make_grasp_selector(
         ValueError: a part is unknown, its weights are missing or wrong, or the detector does not know the class.
     """
     kinematics = Kinematics()
-    detector = detector or make_detector(config.detector, _yolo_config(config))
+    detector = detector or make_detector(config.detector, config.yolo)
     check_object_class(config, detector)
     return GraspSelector(
         kinematics=kinematics,
         perception=Perception(config.perception, detector, T_flange_camera),
-        generator=generator or make_generator(config.generator, _generator_options(config)),
+        generator=generator or make_generator(config.generator, config.generator_options),
         planner=GraspPlanner(kinematics, config.planner, MotionLimits.at_speed(config.speed)),
         config=config,
         T_flange_camera=T_flange_camera,
@@ -62,30 +67,6 @@ def check_object_class(config: RuntimeConfig, detector: Detector) -> None:
     """
     if config.object_class and detector.classes:
         labels_for(config.object_class, detector.classes)
-
-
-def _yolo_config(config: RuntimeConfig) -> YoloConfig:
-    return YoloConfig(
-        weights=Path(config.detector_weights) if config.detector_weights else None,
-        runtime=config.detector_runtime,
-        min_confidence=config.detector_confidence,
-        mirrored=config.detector_mirrored,
-    )
-
-
-def _generator_options(config: RuntimeConfig) -> GeneratorOptions:
-    return GeneratorOptions(
-        weights=Path(config.generator_weights) if config.generator_weights else None,
-        process=config.generator_process,
-        python=Path(config.generator_python) if config.generator_python else None,
-    )
-
-
-_LOG = logging.getLogger(__name__)
-
-_CAN_X_M = 0.48  # middle of the range in which an object is put before the arm, 0.40 to 0.56 m
-_MAX_DEPTH_M = 1.5
-_INTRINSICS = Intrinsics(width=640, height=480, fx=393.0, fy=393.0, cx=319.5, cy=239.5)
 
 
 def warm_up_selector(selector: GraspSelector) -> None:

@@ -43,6 +43,15 @@ def read_yaml(path: Path, what: str) -> Any:
         raise ConfigError(f"{what} {path} is not YAML: {error}", code="not_yaml") from error
 
 
+def plain(value: Any) -> Any:
+    """Return `value`, such as of `asdict`, in the types of YAML and JSON: mappings, lists, and paths as text."""
+    if isinstance(value, Mapping):
+        return {key: plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    return str(value) if isinstance(value, Path) else value
+
+
 def structure(kind: type[T], data: Any, where: str) -> T:
     """Return `data`, as YAML and JSON give it, as the dataclass `kind`; missing keys take their defaults.
 

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from hal.base.errors import InvalidValueError
-from models.detector.runtimes import open_network
+from models.detector.runtimes import RUNTIMES, open_network
 from models.types import Detection
 
 _GREY = 114  # ultralytics' border colour, with which the networks were trained
@@ -215,6 +215,11 @@ class YoloConfig:
     `models/weights/README.md`). Networks with another anchor layout than YOLOv8's process the image alone."""
 
     def __post_init__(self) -> None:
+        if self.runtime not in ("auto", *RUNTIMES):
+            raise InvalidValueError(
+                f"detector: runtime is {self.runtime!r}; allowed is auto, {', '.join(RUNTIMES)}.",
+                code="unknown_runtime",
+            )
         if not 0.0 <= self.min_confidence < 1.0:
             raise InvalidValueError(
                 f"detector: min_confidence is {self.min_confidence}; allowed is 0 up to, but not, 1.",

@@ -103,7 +103,7 @@ def make_nvidia_generator(
     if not python.is_file():
         raise GeneratorError(
             f"there is no Python at {python}; make one with `python -m scripts.train.make_generator_env {name}`, "
-            "or name yours by generator_python.",
+            "or name yours by generator_options.python.",
             code="python_missing",
         )
     return ProcessGenerator(name, checkpoint, python)
@@ -134,7 +134,7 @@ def require_package(package: str, extra: str) -> None:
     if importlib.util.find_spec(package) is None:
         raise GeneratorError(
             f"{package} is not installed here; run `uv sync --inexact --extra {extra}`, or keep it apart: "
-            f"`python -m scripts.train.make_generator_env {extra}` and generator_process: own.",
+            f"`python -m scripts.train.make_generator_env {extra}` and generator_options: {{process: own}}.",
             code="package_missing",
         )
     import torch

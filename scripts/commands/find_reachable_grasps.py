@@ -18,6 +18,7 @@ from rich.console import Console
 from rich.table import Table
 
 from hal.base.errors import InvalidValueError
+from hal.base.files import plain
 from scripts import cli
 from scripts.support.progress import make_progress
 from sim_twin.benchmark.episodes.rows import Row
@@ -26,7 +27,6 @@ from sim_twin.benchmark.episodes.scenarios import OBJECT_SETS, grid
 from sim_twin.benchmark.oracle.report import write_report, write_summary
 from sim_twin.benchmark.oracle.search import METHOD, OracleConfig, OracleTask, run_oracle_task
 from sim_twin.benchmark.results.store import TABLE, Store
-from sim_twin.benchmark.results.summary import plain
 
 
 @dataclass(frozen=True, kw_only=True)

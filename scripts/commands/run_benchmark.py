@@ -104,12 +104,13 @@ class Config:
 
 def main(config: Config) -> int:
     """Run the missing episodes, write the results, and return 1 if any episode ended in an exception, else 0."""
+    from hal.base.files import plain
     from sim_twin.benchmark.episodes.methods import parse_method
     from sim_twin.benchmark.episodes.runner import make_tasks
     from sim_twin.benchmark.episodes.scenarios import OBJECT_SETS, grid
     from sim_twin.benchmark.report.report import write_report
     from sim_twin.benchmark.results.store import Store
-    from sim_twin.benchmark.results.summary import plain, write_summary
+    from sim_twin.benchmark.results.summary import write_summary
     from z1_runtime.config import load_config
 
     methods = [parse_method(text) for text in config.methods]
@@ -133,7 +134,7 @@ def main(config: Config) -> int:
         rows = store.rows()
         if rows:
             store.write_table()
-            run = {"version": version("z1-grasp"), "command": plain(asdict(config)), "settings": asdict(runtime)}
+            run = {"version": version("z1-grasp"), "command": asdict(config), "settings": asdict(runtime)}
             summary = write_summary(rows, config.out / "summary.json", plain(run))
             write_report(rows, summary, report)
             _print_summary(console, summary)

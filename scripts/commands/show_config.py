@@ -9,6 +9,7 @@ from typing import Any
 
 import yaml
 
+from hal.base.files import plain
 from z1_runtime.config import load_config
 
 
@@ -44,11 +45,5 @@ def to_lines(values: Mapping[str, Any], given: Mapping[str, Any], source: str, d
             yield from to_lines(value, given.get(key) or {}, source, depth + 1)
         else:
             # One line for each value, however long; "..." is YAML's end of a lone scalar
-            text = yaml.safe_dump(_plain(value), default_flow_style=True, width=10_000).removesuffix("...\n").strip()
+            text = yaml.safe_dump(plain(value), default_flow_style=True, width=10_000).removesuffix("...\n").strip()
             yield f"{indent}{key}: {text}  # {source if key in given else 'default'}"
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, tuple | list):
-        return [_plain(item) for item in value]
-    return value if isinstance(value, int | float | str | bool | None) else str(value)

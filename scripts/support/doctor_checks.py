@@ -194,7 +194,7 @@ def check_detector() -> Check:
     used, best = runtimes[0], min(ms, key=lambda name: ms[name])
     found = ", ".join(f"{name} {ms[name]:.0f} ms" for name in runtimes) + f"; {used} is used"
     if ms[used] > 1.3 * ms[best]:
-        return Check("detector", State.WARN, found, f"detector_runtime: {best} in the configuration (--config)")
+        return Check("detector", State.WARN, found, f"yolo: {{runtime: {best}}} in the configuration (--config)")
     return Check("detector", State.OK, found)
 
 

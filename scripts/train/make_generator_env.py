@@ -3,7 +3,7 @@
     python -m scripts.train.make_generator_env graspgen      # research and evaluation only: NVIDIA's licence
     python -m scripts.train.make_generator_env graspgenx
 
-Afterwards `generator: graspgen`, `generator_process: own` and `generator_weights: FILE` in the configuration use it.
+Afterwards `generator: graspgen`, `generator_options: {process: own, weights: FILE}` in the configuration use it.
 Nothing else installs anything: a generator without its environment raises an error.
 """
 

@@ -73,7 +73,7 @@ def test_a_typing_error_gets_a_suggestion_and_a_wrong_value_its_range(tmp_path: 
         assert hint in str(caught.value)
 
 
-@pytest.mark.parametrize("content", [b"detector_weights: gew\xfcrz.pt", None])
+@pytest.mark.parametrize("content", [b"generator: gew\xfcrz", None])
 def test_an_unreadable_file_is_rejected(tmp_path: Path, content: bytes | None) -> None:
     path = tmp_path / "c.yaml"
     if content is not None:
@@ -89,6 +89,6 @@ def test_a_command_line_s_weights_choose_their_generator_unless_one_that_takes_t
     assert with_generator(plain, None, None) == plain
     assert with_generator(plain, "obb_sweep", None).generator == "obb_sweep"
     chosen = with_generator(plain, None, weights)
-    assert (chosen.generator, chosen.generator_weights) == ("graspgen", str(weights))
+    assert (chosen.generator, chosen.generator_options.weights) == ("graspgen", weights)
     assert with_generator(union, None, weights).generator == union.generator
     assert with_generator(plain, union.generator, weights).generator == union.generator

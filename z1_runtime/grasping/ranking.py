@@ -14,7 +14,7 @@ import numpy as np
 import yaml
 
 from hal.base.errors import ConfigError, InvalidValueError, UsageError
-from hal.base.files import atomic_write, read_yaml, structure
+from hal.base.files import atomic_write, plain, read_yaml, structure
 from hal.base.transforms import transform_points
 from models.obb.mvbb import FitMethod, fit_obb, nearest_faces
 from models.obb.obb import OrientedBox
@@ -210,7 +210,7 @@ class Scoring:
 
 def save_scoring(scoring: Scoring, path: Path) -> None:
     """Write `scoring` to `path`, for `load_scoring`; an interrupted write leaves no file there."""
-    content = {"format": FORMAT, "version": VERSION, **_plain(asdict(scoring))}
+    content = {"format": FORMAT, "version": VERSION, **plain(asdict(scoring))}
     atomic_write(path, yaml.safe_dump(content, sort_keys=False, allow_unicode=True, width=120))
 
 
@@ -238,12 +238,3 @@ def load_scoring(path: Path) -> Scoring:
     except ConfigError as error:
         code = "scoring_incomplete" if error.code == "missing_key" else "scoring_value"
         raise ScoringError(f"{error} {_REMAKE}", code=code) from error
-
-
-def _plain(value: Any) -> Any:
-    """Return `value` as YAML's own types."""
-    if isinstance(value, Mapping):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, tuple | list):
-        return [_plain(item) for item in value]
-    return value

@@ -160,7 +160,7 @@ class GraspSelector:
         with times.stage("detect"):
             filtered = self.perception.filter_self(frame, float(q[-1]))
             T_base_camera = self.kinematics.flange(q[: z1.N_ARM]) @ filtered.T_flange_camera
-            detection = self.perception.detect(filtered, T_base_camera, self.config.object_class or None)
+            detection = self.perception.detect(filtered, T_base_camera, self.config.object_class)
         with times.stage("cloud"):
             return self.perception.segment(filtered, T_base_camera, detection)
 

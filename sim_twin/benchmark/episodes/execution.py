@@ -2,31 +2,29 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Any, Self
 
 import numpy as np
 
-from hal.base import z1
 from hal.base.errors import HalError
 from hal.base.messages import RgbdFrame
-from hal.servo.guard import Guard
-from hal.servo.servo import Servo
+from hal.rig import connect_rig
 from sim_twin.backends import make_rig
 from sim_twin.benchmark.episodes.contact_monitor import KNOCKED_M, KNOCKED_RAD, ContactMonitor
 from sim_twin.model.scene import SceneConfig
 from sim_twin.model.world import World
+from z1_runtime.config import RuntimeConfig
 from z1_runtime.geometry.kinematics import Kinematics
 from z1_runtime.motion.executor import Executor, MotionError
-from z1_runtime.motion.trajectory import MotionLimits, PathFailure, hold, joint_move, straight_move
+from z1_runtime.motion.trajectory import MotionLimits, PathFailure, hold, straight_move
+from z1_runtime.robot import Robot
 from z1_runtime.types import GraspPlan, JointTrajectory
 
 MIN_LIFT_M, MAX_SLIP_M, HOLD_S, CARRY_M = 0.05, 0.02, 1.0, 0.03
 """Success: at least 50 mm up for 1 s after a lift and a 30 mm sideways move, and under 20 mm of slip in the jaws."""
 _MAX_TABLE_FORCE_N = 5.0
-_FRAME_TIMEOUT_S = 1.0
 
 
 class Mode(StrEnum):
@@ -82,37 +80,41 @@ class Outcome:
 
 
 class EpisodeRobot:
-    """A lock-step arm at home in a scene of its own, with camera and ground-truth monitor; use it with `with`."""
+    """The lock-step `Robot` of an episode, at home in a scene of its own, with a ground-truth monitor.
+
+    Use it in a `with` block. The camera is connected by the first `capture`, as a connected one holds a renderer.
+
+    Args:
+        scene: objects on the table.
+        kinematics: shared by the episodes; None = loaded.
+        speed: fraction of the arm's limits.
+    """
 
     def __init__(self, scene: SceneConfig, kinematics: Kinematics | None = None, speed: float = 0.5) -> None:
         rig = make_rig(scene, lockstep=True)
         assert rig.call_every_tick is not None
         self.world: World = rig.world
-        self._rig, self._undo = rig, ExitStack()
-        self._servo, self._watch = Servo(rig.arm, rig.clock, guard=Guard()), ContactMonitor(rig.world)
-        self._executor = Executor(self._servo, rig.clock)
+        self._watch = ContactMonitor(rig.world)
+        self._robot = Robot(connect_rig(rig, camera=False), config=RuntimeConfig(speed=speed), owner="bench")
+        self._executor = Executor(self._robot.arm, self._robot.clock)
         self._kinematics, self._limits = kinematics or Kinematics(), MotionLimits.at_speed(speed)
         self._sees = False
-        rig.call_every_tick(self._servo.tick)
-        rig.call_every_tick(self._watch.tick)
+        rig.call_every_tick(self._watch.tick)  # after the servo's own
 
     def __enter__(self) -> Self:
-        self._servo.connect()
-        self._undo.callback(self._servo.disconnect)
-        self._servo.claim("bench")
+        self._robot.arm.claim("bench")
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._undo.close()
+        self._robot.close()
 
     def capture(self) -> tuple[RgbdFrame, np.ndarray]:
         """Return the camera's next frame and the joints (7,) it was taken at [rad], once the arm rests."""
         if not self._sees:
-            self._rig.camera.connect()
-            self._undo.callback(self._rig.camera.disconnect)
+            self._robot.camera.connect()
             self._sees = True
         state = self._executor.settle()
-        return self._rig.camera.wait_for_frame(_FRAME_TIMEOUT_S), state.q
+        return self._robot.frame(), state.q
 
     def execute(self, plan: GraspPlan) -> Outcome:
         """Grasp, lift, carry sideways and hold; return the outcome."""
@@ -145,10 +147,10 @@ class EpisodeRobot:
         if outcome.mode is Mode.SLIPPED:
             # The way back is the way that was checked for collisions
             for motion in (plan.lift, plan.close, plan.approach):
-                self._move_to(motion.q[-1])
+                self._robot.move_to(motion.q[-1])
                 self._executor.execute(_reversed(motion))
                 self._executor.settle()
-        self._move_to(np.append(z1.Q_HOME, jaw_home))
+        self._robot.home(jaw=jaw_home)
 
     def _grasp_and_lift(self, plan: GraspPlan, carry_motion: JointTrajectory, known: dict[str, Any]) -> None:
         """Execute all motions, and write each figure into `known` as soon as it is known."""
@@ -173,13 +175,6 @@ class EpisodeRobot:
         executor.execute(hold(carry_motion.q[-1], HOLD_S))
         # In the frame of the stationary jaw the arm's own motion does not count as slip
         known["slip_m"] = float(np.linalg.norm(watch.T_gripper_object()[:3, 3] - closed[:3, 3]))
-
-    def _move_to(self, q_goal: np.ndarray) -> None:
-        """Move straight in joint space from the last commanded position to `q_goal` (7,) [rad]."""
-        q = np.clip(self._servo.status().q_command, z1.Q_MIN, z1.Q_MAX)
-        if np.abs(q - q_goal).max() > 1e-6:
-            self._executor.execute(joint_move(q, q_goal, self._limits))
-            self._executor.settle()
 
 
 def capture(scene: SceneConfig) -> tuple[RgbdFrame, np.ndarray]:

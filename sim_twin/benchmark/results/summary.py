@@ -63,15 +63,6 @@ def write_summary(rows: Sequence[Row], path: Path, run: dict[str, Any]) -> dict[
     return content
 
 
-def plain(value: Any) -> Any:
-    """Return `value` with paths as text, for JSON."""
-    if isinstance(value, dict):
-        return {key: plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
-    return str(value) if isinstance(value, Path) else value
-
-
 def _breakdown(rows: Sequence[Row], column: str) -> dict[str, dict[str, Any]]:
     parts: dict[str, list[Row]] = {}
     for row in rows:

@@ -70,7 +70,7 @@ def test_fitted_values_that_win_are_written_and_loaded_by_the_runtime(log, tmp_p
     assert scoring.tuned == ("mvb", "full")
     assert scoring.evidence["evaluated_on_seeds"] == [2]
     assert scoring.evidence["evaluated"]["mvb"][0]["top1"]["tuned"] == 81
-    assert ranking_of(RuntimeConfig(scoring=str(out / "scoring.yaml"))).k_faces == 3
+    assert ranking_of(RuntimeConfig(scoring=out / "scoring.yaml")).k_faces == 3
     assert json.loads((out / "tuning.json").read_text())["verdicts"]["full"].startswith("took k=3")
     assert "<svg" in (out / "report.html").read_text()
 

@@ -116,14 +116,14 @@ def test_a_selector_reads_the_file_that_its_configuration_names(tmp_path):
 
     path = tmp_path / "scoring.yaml"
     save_scoring(Scoring(mvb=Ranking(), full=plain.ranking), path)
-    same = selector(RuntimeConfig(detector="tabletop", scoring=str(path))).select(frame, q).ranked
+    same = selector(RuntimeConfig(detector="tabletop", scoring=path)).select(frame, q).ranked
     assert same.indices.tolist() == configured.indices.tolist()
 
     save_scoring(Scoring(mvb=Ranking(), full=replace(plain.ranking, k_faces=1, head=HIGHER_IS_BETTER)), path)
-    fitted = selector(RuntimeConfig(detector="tabletop", scoring=str(path))).select(frame, q).ranked
+    fitted = selector(RuntimeConfig(detector="tabletop", scoring=path)).select(frame, q).ranked
     assert 0 < len(fitted) < len(configured)
     assert fitted.indices[0] != configured.indices[0]
 
     path.write_text("format: other")
     with raises(ScoringError, "scoring_format"):
-        selector(RuntimeConfig(detector="tabletop", scoring=str(path)))
+        selector(RuntimeConfig(detector="tabletop", scoring=path))

@@ -81,7 +81,7 @@ def test_thresholds_separate_grasps_and_a_missing_alignment_passes() -> None:
 
 def test_the_runtime_ranks_by_its_configuration_or_by_the_file_it_names(file: Path) -> None:
     assert ranking_of(RuntimeConfig(k_faces=4, alpha=0.1)) == Ranking(k_faces=4, alpha=0.1, box_method="upright")
-    assert ranking_of(RuntimeConfig(k_faces=4, scoring=str(file))) == FITTED.full
+    assert ranking_of(RuntimeConfig(k_faces=4, scoring=file)) == FITTED.full
 
 
 @pytest.mark.parametrize(

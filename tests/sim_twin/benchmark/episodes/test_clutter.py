@@ -71,7 +71,7 @@ def test_neighbours_stand_and_one_that_is_pushed_over_is_counted():
 def test_a_detector_without_classes_is_pointed_at_the_object(lateral):
     scenario = replace(CLUTTERED, lateral=lateral)
     config, detector = select_target(RuntimeConfig(), TabletopDetector(), scenario)
-    assert config.object_class == ""
+    assert config.object_class is None
     frame, q = capture(scenario.scene())
     T_base_camera = Kinematics().flange(q[:6]) @ scenario.scene().T_flange_camera()
     assert len(TabletopDetector().detect(frame, T_base_camera)) > 1
