@@ -1,8 +1,10 @@
-"""Grasp generators by name; each imports its dependencies only when it is made."""
+"""Grasp generators by name, ours and installed ones; each imports its dependencies only when it is made."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -17,7 +19,9 @@ GENERATORS = {
     "graspgen": "NVIDIA's GraspGen; checkpoints that you bring, non-commercial",
     "graspgenx": "NVIDIA's GraspGenX conditioned on the Z1's gripper; checkpoints that you bring",
 }
-"""Generator names and their descriptions."""
+"""Names of this project's generators and their descriptions."""
+ENTRY_POINTS = "z1_grasp.generators"
+"""Group of entry points by which an installed package adds generators: name to a callable without arguments."""
 UNION = "union:"
 """`union:a+b` joins any of them, all scored by the learned discriminator."""
 Process = Literal["in", "own"]
@@ -44,6 +48,12 @@ class GeneratorOptions:
             )
 
 
+@cache
+def installed_generators() -> dict[str, EntryPoint]:
+    """Return the generators that installed packages add, by name; they cannot replace this project's own."""
+    return {entry.name: entry for entry in entry_points(group=ENTRY_POINTS) if entry.name not in GENERATORS}
+
+
 def split_generator_name(name: str) -> tuple[str, ...]:
     """Return the members of a generator's name: one, or several for a `union:a+b`.
 
@@ -52,8 +62,8 @@ def split_generator_name(name: str) -> tuple[str, ...]:
     """
     members = tuple(name.removeprefix(UNION).split("+")) if name.startswith(UNION) else (name,)
     for member in members:
-        if member not in GENERATORS:
-            known = ", ".join(GENERATORS)
+        if member not in GENERATORS and member not in installed_generators():
+            known = ", ".join([*GENERATORS, *installed_generators()])
             raise InvalidValueError(
                 f"there is no generator {member!r}; known: {known}, or {UNION}a+b of any of them.",
                 code="unknown_generator",
@@ -131,6 +141,8 @@ def _make_one(name: str, options: GeneratorOptions, weights: Path | None) -> Gra
 
         gripper = "agnostic" if name == "diffusion" else "z1"
         return DiffusionSampler(DiffusionConfig(gripper=gripper, weights=weights, max_width_m=MAX_WIDTHS_M[gripper]))
+    if name in installed_generators():
+        return installed_generators()[name].load()()
     from models.nvidia.nvidia import make_nvidia_generator
 
     return make_nvidia_generator(name, weights, own_process=options.process == "own", python=options.python)

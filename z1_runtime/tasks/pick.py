@@ -180,6 +180,7 @@ class PickTask:
     def _log(self, selection: GraspSelection) -> None:
         observation, ranked = selection.observation, selection.ranked
         self.logger.log_observation(observation)
+        self.logger.log_planning_scene(selection.scene)
         self.logger.log_box(ranked.box, ranked.faces, observation.T_base_camera)
         self.logger.log_candidates(ranked.grasps, observation.T_base_camera)
         self.logger.log_plan(selection.plan)

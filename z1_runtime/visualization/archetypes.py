@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from hal.base.messages import ArmState, Intrinsics, RgbdFrame, ServoStatus
 from models.obb.obb import OrientedBox
 from models.types import GraspSet
+from z1_runtime.collision.planning_scene import PlanningScene
 from z1_runtime.types import GraspPlan, Observation
 from z1_runtime.visualization import blueprint
 from z1_runtime.visualization.robot_view import Drawing, RobotView
@@ -25,6 +26,7 @@ _FINGER_M = 0.04
 _DEFAULT_WIDTH_M = 0.06  # drawn where the generator gives no width
 _OBJECT_COLOUR = (255, 140, 0)
 _CHOSEN_COLOUR = (0, 220, 90)
+_OBSTACLE_COLOUR, _OCCLUDED_COLOUR = (200, 60, 60), (150, 120, 200)
 
 
 def draw_frame(frame: RgbdFrame, T_base_camera: np.ndarray) -> Drawing:
@@ -66,6 +68,13 @@ def draw_observation(observation: Observation) -> Drawing:
         f"{found.label} at {found.box_px}, confidence {found.confidence:.2f}, {len(observation.object_points)} points"
     )
     yield blueprint.LOG, rr.TextLog(text, level="INFO")
+
+
+def draw_planning_scene(scene: PlanningScene) -> Drawing:
+    """Points that ranking and planning keep clear of, and where the object may continue unobserved; both in base."""
+    obstacles = scene.scene_index.points[:: max(1, -(-len(scene.scene_index) // _SCENE_POINTS))]
+    yield blueprint.OBSTACLES, rr.Points3D(obstacles, colors=_OBSTACLE_COLOUR, radii=0.0015)
+    yield blueprint.OCCLUDED, rr.Points3D(scene.occluded_points, colors=_OCCLUDED_COLOUR, radii=0.0012)
 
 
 def draw_box(box: OrientedBox | None, faces: np.ndarray, T_base_camera: np.ndarray) -> Drawing:

@@ -17,6 +17,7 @@ from models.types import GraspSet
 from z1_runtime.types import GraspPlan, Observation
 
 if TYPE_CHECKING:  # an idle logger does not load Rerun
+    from z1_runtime.collision.planning_scene import PlanningScene
     from z1_runtime.visualization.robot_view import Drawing
 
 logger = logging.getLogger(__name__)
@@ -94,6 +95,10 @@ class RerunLogger:
         stamp_s = observation.frame.stamp_s
         self._put(stamp_s, lambda: self._archetypes.draw_frame(observation.frame, observation.T_base_camera))
         self._put(stamp_s, lambda: self._archetypes.draw_observation(observation))
+
+    def log_planning_scene(self, scene: PlanningScene) -> None:
+        """Log the obstacles of ranking and planning, and the occluded part of the object."""
+        self._put(None, lambda: self._archetypes.draw_planning_scene(scene))
 
     def log_box(self, box: OrientedBox | None, faces: np.ndarray, T_base_camera: np.ndarray) -> None:
         """Log the box with the `faces` (k,) that may be approached; None clears it."""

@@ -19,6 +19,7 @@ from hal.base.messages import ArmState, Intrinsics, RgbdFrame, ServoMode, ServoS
 from models.obb.obb import OrientedBox
 from models.types import Detection, GraspSet
 from tests.support.errors import raises
+from z1_runtime.collision.planning_scene import PlanningScene
 from z1_runtime.geometry.kinematics import Kinematics
 from z1_runtime.types import (
     GraspPlan,
@@ -113,6 +114,7 @@ def log_everything(logger: RerunLogger) -> None:
         logger.log_frame(make_frame(step / 10), np.eye(4))
     logger.log_arm(*make_arm(2.0, ServoMode.BRAKING))
     logger.log_observation(make_observation(2.0))
+    logger.log_planning_scene(PlanningScene.from_observation(make_observation(2.0), None, Kinematics()))
     logger.log_box(box, np.array([1, 4]), np.eye(4))
     logger.log_candidates(make_grasps(30), np.eye(4))
     logger.log_plan(make_plan())
