@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import re
 
+import pytest
 from hypothesis import settings
 
 pytest_plugins = ["tests.support.faults_table"]
@@ -16,3 +18,16 @@ settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci"))
 
 # Calibration results of this machine must not change a test.
 os.environ["Z1_CALIBRATIONS"] = "/nonexistent/calibrations"
+
+_OFF_BY_DEFAULT = ("hardware", "slow")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Deselect hardware and slow tests unless the -m expression names their marker.
+
+    As an -m in pyproject's addopts they would come back with any -m of the command line, which replaces it.
+    """
+    unnamed = [name for name in _OFF_BY_DEFAULT if name not in re.findall(r"\w+", config.option.markexpr)]
+    left_out = [item for item in items if any(item.get_closest_marker(name) for name in unnamed)]
+    config.hook.pytest_deselected(items=left_out)
+    items[:] = [item for item in items if item not in left_out]

@@ -24,6 +24,7 @@ _HUBER = 2.5  # standard deviations above which a corner's loss is linear instea
 _MIN_CORNER_NOISE_PX = 1e-4  # exact synthetic corners would make the weights infinite
 _MIN_DEPTH_M = 1e-3
 _ROUNDS = 2  # the Jacobian is exact at the start of each
+_INITIAL_HUBER = 1.5  # the first round's, in medians of the residuals at its start
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -78,14 +79,17 @@ def refine_jointly(
 ) -> tuple[PoseFit, np.ndarray]:
     """Return the refined fit and the covariance (6, 6) of the camera's ξ; the scale is kept."""
     bundle = _Bundle(refine, data, fit, noise, np.flatnonzero(kept))
-    for _ in range(_ROUNDS):
-        n = 12 + 6 * len(bundle.samples)
+    start = np.zeros(12 + 6 * len(bundle.samples))
+    for k in range(_ROUNDS):
+        # Where most corners are beyond the Huber limit the loss has hardly any curvature and the steps are tiny. The
+        # first round therefore begins with a limit that most are within
+        initial = _INITIAL_HUBER * float(np.median(np.abs(bundle.corner_residuals(start)))) if k == 0 else 0.0
         found = least_squares(
             bundle.residuals,
-            np.zeros(n),
+            start,
             jac=bundle.compute_jacobian,  # pyright: ignore[reportArgumentType] - SciPy's stub does not list functions
             loss="huber",
-            f_scale=_HUBER,
+            f_scale=max(_HUBER, initial),
             x_scale=bundle.x_scale,
         )
         bundle.fit = bundle.apply_step(found.x)
@@ -120,10 +124,14 @@ class _Bundle:
 
     def residuals(self, x: np.ndarray) -> np.ndarray:
         """Return corner errors and η in standard deviations."""
+        return np.concatenate([self.corner_residuals(x), (x[12:].reshape(-1, 6) / self._arm).ravel()])
+
+    def corner_residuals(self, x: np.ndarray) -> np.ndarray:
+        """Return the errors of all corners along both axes in standard deviations."""
         parts = []
-        for k, points in enumerate(self._camera_points(x)):
-            parts.append((self._camera.project(points[0]) - self._views[k].pixels_px).ravel() / self._sd_px)
-        return np.concatenate([*parts, (x[12:].reshape(-1, 6) / self._arm).ravel()])
+        for view, (in_camera, _, _) in zip(self._views, self._camera_points(x), strict=True):
+            parts.append((self._camera.project(in_camera) - view.pixels_px).ravel() / self._sd_px)
+        return np.concatenate(parts)
 
     def compute_jacobian(self, x: np.ndarray) -> np.ndarray:
         """Return the derivatives of `residuals`."""

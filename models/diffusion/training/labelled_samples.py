@@ -17,6 +17,7 @@ from models.diffusion.training.data import GraspData
 from models.diffusion.training.dynamics_test import simulate_grasps
 from models.diffusion.training.grippers import AnyGripper, ParallelGripperSpec
 from models.diffusion.training.labels import check_grasps
+from models.torch_threads import has_bfloat16
 
 ProgressCallback = Callable[[int, float], None]
 """Called with the number of items done and the current value (a loss, or a ratio)."""
@@ -107,7 +108,7 @@ def _label_chunk(  # noqa: PLR0917
     for start in range(0, len(views), _BATCH):
         part = views[start : start + _BATCH]
         cloud = torch.from_numpy(data.clouds[part].astype(np.float32))
-        with torch.autocast("cpu", torch.bfloat16):
+        with torch.autocast("cpu", torch.bfloat16, enabled=has_bfloat16()):
             own = generator.sample(cloud, torch.randn(len(part), config.samples, N_COORDINATES), config.steps)
         T, widths = data.draw_grasps(part, config.perturbed, rng)
         v = torch.cat([own.float(), _perturb(encode_grasps(torch.from_numpy(T), torch.from_numpy(widths)))], dim=1)

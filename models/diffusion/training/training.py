@@ -18,6 +18,7 @@ from hal.base.files import atomic_path
 from models.diffusion.network import Denoiser, Discriminator, encode_grasps
 from models.diffusion.training.data import GraspData, augment
 from models.diffusion.training.labelled_samples import LabelledSamples, LabellingConfig, ProgressCallback
+from models.torch_threads import has_bfloat16
 
 ModuleT = TypeVar("ModuleT", bound=nn.Module)
 
@@ -165,7 +166,7 @@ def _descend(
     seed: int,
     checkpoint: Path,
 ) -> Iterator[tuple[int, float]]:
-    """Yield (iteration, loss) while AdamW runs down a cosine; `average` follows `model`. bfloat16 where it helps."""
+    """Yield (iteration, loss) while AdamW runs down a cosine; `average` follows `model`. bfloat16 where the processor has it."""
     optimiser = torch.optim.AdamW(model.parameters(), lr=rate, betas=(0.9, 0.98), weight_decay=0.01)
     start = 0
     if checkpoint.exists():
@@ -181,7 +182,7 @@ def _descend(
         torch.manual_seed(seed * 1_000_003 + iteration)
         for group in optimiser.param_groups:
             group["lr"] = rate * min(1.0, (iteration + 1) / 100) * _cosine(iteration / iterations)
-        with torch.autocast("cpu", torch.bfloat16):
+        with torch.autocast("cpu", torch.bfloat16, enabled=has_bfloat16()):
             loss = loss_at(rng)
         optimiser.zero_grad()
         loss.backward()
