@@ -17,7 +17,7 @@ from models.diffusion.training.data import GraspData
 from models.diffusion.training.dynamics_test import simulate_grasps
 from models.diffusion.training.grippers import AnyGripper, ParallelGripperSpec
 from models.diffusion.training.labels import check_grasps
-from models.torch_threads import has_bfloat16
+from models.weights_file import has_bfloat16
 
 ProgressCallback = Callable[[int, float], None]
 """Called with the number of items done and the current value (a loss, or a ratio)."""

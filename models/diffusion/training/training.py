@@ -18,7 +18,7 @@ from hal.base.files import atomic_path
 from models.diffusion.network import Denoiser, Discriminator, encode_grasps
 from models.diffusion.training.data import GraspData, augment
 from models.diffusion.training.labelled_samples import LabelledSamples, LabellingConfig, ProgressCallback
-from models.torch_threads import has_bfloat16
+from models.weights_file import has_bfloat16
 
 ModuleT = TypeVar("ModuleT", bound=nn.Module)
 
@@ -166,7 +166,7 @@ def _descend(
     seed: int,
     checkpoint: Path,
 ) -> Iterator[tuple[int, float]]:
-    """Yield (iteration, loss) while AdamW runs down a cosine; `average` follows `model`. bfloat16 where the processor has it."""
+    """Yield (iteration, loss) while AdamW runs down a cosine; `average` follows `model`."""
     optimiser = torch.optim.AdamW(model.parameters(), lr=rate, betas=(0.9, 0.98), weight_decay=0.01)
     start = 0
     if checkpoint.exists():
