@@ -31,6 +31,8 @@ COMMAND_PORT = 8071
 """Bound by the controller."""
 STATE_PORT = 8072
 """Bound by the client; a second arm has another pair."""
+WATCHDOG_S = 2.2
+"""Silence of the client [s] after which the controller falls to PASSIVE, and the arm sinks (measured)."""
 COMMAND_SIZE = 147
 STATE_SIZE = 208
 
@@ -49,8 +51,11 @@ KD_PASSIVE = np.array([10.0, 100.0, 300.0, 10.0, 10.0, 10.0, 0.0])
 LABELS = {
     "forward": np.array([0.0, 1.5, -1.0, -0.54, 0.0, 0.0]),
     "startFlat": np.array([0.0, 0.0, -0.005, -0.074, 0.0, 0.0]),
+    "show_left": np.array([-1.0, 0.9, -1.0, -0.3, 0.0, 0.0]),
+    "show_mid": np.array([0.0, 0.9, -1.2, 0.25, 0.0, 0.0]),
+    "show_right": np.array([1.0, 0.9, -1.0, -0.3, 0.0, 0.0]),
 }
-"""Saved labels whose joints (6,) are known [rad]; `show_left`, `show_mid` and `show_right` are saved as well."""
+"""Saved labels of every controller: joints (6,) [rad]."""
 for _constant in (KP_LOWCMD, KD_LOWCMD, KP_JOINTCTRL, KD_JOINTCTRL, KD_PASSIVE, *LABELS.values()):
     _constant.setflags(write=False)
 
@@ -132,7 +137,7 @@ class Command:
             ProtocolError: not 1 to 10 printable ASCII characters.
         """
         name = self.body[:_LABEL_SIZE].split(b"\0", 1)[0]
-        if not name or not all(0x20 < byte < 0x7F for byte in name):
+        if not name or name[0] == 0x20 or not all(0x20 <= byte < 0x7F for byte in name):
             raise ProtocolError(
                 f"a label is {name!r}; allowed are 1 to {_LABEL_SIZE} printable ASCII characters.", code="label"
             )
@@ -236,7 +241,7 @@ def decode_state(data: bytes | memoryview) -> ControllerState:
 
 def _pack_label(label: str) -> bytes:
     packed = label.encode("ascii", "replace")  # `isascii` below rejects the replaced ones
-    if not 1 <= len(packed) <= _LABEL_SIZE or not label.isascii() or not label.isprintable() or " " in label:
+    if not 1 <= len(packed) <= _LABEL_SIZE or not (label.isascii() and label.isprintable()) or label[0] == " ":
         raise ProtocolError(
             f"the label {label!r} cannot be sent; allowed are 1 to {_LABEL_SIZE} printable ASCII characters.",
             code="label",

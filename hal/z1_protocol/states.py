@@ -51,18 +51,18 @@ MOVES = frozenset(
 )
 """States in which the controller moves (or saves) by itself; done, it falls back to JOINTCTRL."""
 
-# Measured: MOVEJ is ignored in PASSIVE, and LOWCMD is granted there alone.
 _FROM_PASSIVE = {Fsm.JOINTCTRL, Fsm.CARTESIAN, Fsm.BACKTOSTART, Fsm.LOWCMD, Fsm.CALIBRATION}
-_FROM_LOWCMD = {Fsm.JOINTCTRL, Fsm.PASSIVE}
-_FROM_MOVING = {Fsm.JOINTCTRL, Fsm.PASSIVE}
-_FROM_HOLDING = MOVES | {Fsm.PASSIVE, Fsm.JOINTCTRL, Fsm.CARTESIAN, Fsm.TEACH, Fsm.SETTRAJ}
+_FROM_LOWCMD = {Fsm.JOINTCTRL, Fsm.PASSIVE, Fsm.BACKTOSTART}
+_FROM_MOVING = {Fsm.JOINTCTRL, Fsm.PASSIVE, Fsm.BACKTOSTART}
+_FROM_CARTESIAN = (MOVES - {Fsm.TEACHREPEAT}) | {Fsm.PASSIVE, Fsm.JOINTCTRL, Fsm.CARTESIAN, Fsm.SETTRAJ}
+_FROM_JOINTCTRL = _FROM_CARTESIAN | {Fsm.TEACH, Fsm.TEACHREPEAT}
 
 
 def is_granted(present: Fsm, requested: Fsm) -> bool:
     """Return whether the controller, in state `present`, grants a request for `requested`; else it ignores it.
 
-    Measured on the vendor's controller: everything about PASSIVE and LOWCMD, and that moves start from JOINTCTRL.
-    Assumed from the vendor's examples: moves from CARTESIAN, and JOINTCTRL or PASSIVE out of a move or a teaching.
+    Measured on the vendor's controller, except for moves from CARTESIAN and for JOINTCTRL or PASSIVE out of a move,
+    which the vendor's examples use.
     """
     if requested in (present, Fsm.INVALID):
         return True
@@ -71,7 +71,9 @@ def is_granted(present: Fsm, requested: Fsm) -> bool:
             return requested in _FROM_PASSIVE
         case Fsm.LOWCMD:
             return requested in _FROM_LOWCMD
-        case Fsm.JOINTCTRL | Fsm.CARTESIAN:
-            return requested in _FROM_HOLDING
+        case Fsm.JOINTCTRL:
+            return requested in _FROM_JOINTCTRL
+        case Fsm.CARTESIAN:
+            return requested in _FROM_CARTESIAN
         case _:
             return requested in _FROM_MOVING

@@ -121,9 +121,10 @@ def test_a_label_has_the_measured_layout() -> None:
     assert controller.decode_command(data).label() == "startFlat"
     full = controller.encode_command(Fsm.TOSTATE, "0123456789")
     assert controller.decode_command(full).label() == "0123456789"
+    assert controller.decode_command(controller.encode_command(Fsm.TOSTATE, "my label")).label() == "my label"
 
 
-@pytest.mark.parametrize("label", ["", "01234567890", "grün", "two words", "a\nb"])
+@pytest.mark.parametrize("label", ["", "01234567890", "grün", "a\nb"])
 def test_a_label_that_cannot_be_sent_is_rejected(label: str) -> None:
     with raises(ProtocolError, "label"):
         controller.encode_command(Fsm.TOSTATE, label)

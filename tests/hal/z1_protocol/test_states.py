@@ -20,12 +20,19 @@ from hal.z1_protocol.states import MOVES, Fsm, is_granted
         (Fsm.LOWCMD, Fsm.JOINTCTRL, True),
         (Fsm.LOWCMD, Fsm.PASSIVE, True),
         (Fsm.LOWCMD, Fsm.MOVEJ, False),
+        (Fsm.LOWCMD, Fsm.BACKTOSTART, True),
         (Fsm.JOINTCTRL, Fsm.MOVEJ, True),
         (Fsm.JOINTCTRL, Fsm.TOSTATE, True),
         (Fsm.CARTESIAN, Fsm.BACKTOSTART, True),
         (Fsm.MOVEJ, Fsm.JOINTCTRL, True),
         (Fsm.MOVEJ, Fsm.MOVEL, False),
         (Fsm.TEACH, Fsm.JOINTCTRL, True),
+        (Fsm.TEACH, Fsm.BACKTOSTART, True),
+        (Fsm.TOSTATE, Fsm.BACKTOSTART, True),
+        (Fsm.JOINTCTRL, Fsm.TEACHREPEAT, True),
+        (Fsm.JOINTCTRL, Fsm.TRAJECTORY, True),
+        (Fsm.CARTESIAN, Fsm.TEACH, False),
+        (Fsm.CARTESIAN, Fsm.TEACHREPEAT, False),
     ],
 )
 def test_a_request_is_granted_as_the_controller_grants_it(present: Fsm, requested: Fsm, expected: bool) -> None:
@@ -38,7 +45,7 @@ def test_staying_is_always_granted(state: Fsm) -> None:
     assert is_granted(state, Fsm.INVALID)
 
 
-@pytest.mark.parametrize("state", sorted(MOVES))
-def test_no_move_starts_from_lowcmd_or_during_another(state: Fsm) -> None:
+@pytest.mark.parametrize("state", sorted(MOVES - {Fsm.BACKTOSTART}))
+def test_no_move_but_the_one_to_the_start_begins_in_lowcmd_or_during_another(state: Fsm) -> None:
     assert not is_granted(Fsm.LOWCMD, state)
     assert not is_granted(Fsm.TRAJECTORY if state is not Fsm.TRAJECTORY else Fsm.MOVEL, state)
