@@ -21,9 +21,8 @@ MAX_LATENCY_S = 0.05
 _QUIET_S = 0.008
 _MAX_PROBE_S = 0.1
 _MAX_TRACKED = 64
+_RECENT = 16
 _LATE_COUNT = 3  # one late answer may be a hiccup of this machine or of the controller's
-_GOOD_COUNT = 50  # a tenth of a second without a late answer ends such a series
-_MAX_LATE_S = 1.0
 _CAPACITY = 15_000  # half a minute of answers
 
 
@@ -39,7 +38,7 @@ class CommandPacer:
     """Accounting of the commands sent and the answers received.
 
     Commands that are lost on the way are recognised by quiet: an answer has come since the last command, and then none
-    for four cycles. If they are answered after all, they were late, behind those of another program.
+    for four cycles, or for longer than the last answers took where they were late.
     """
 
     def __init__(self) -> None:
@@ -50,15 +49,15 @@ class CommandPacer:
         self.unsolicited = 0
         """Answers to no command of this driver."""
         self._unanswered: deque[tuple[int, float]] = deque()
-        self._missing_s: deque[float] = deque(maxlen=_MAX_TRACKED)
+        self._recent_s: deque[float] = deque([0.0], maxlen=_RECENT)
         self._active_s = -np.inf  # of the last command or answer
         self._answered_since_sent = False
         self._probe_s = _QUIET_S
         self._ring_ms = np.zeros(_CAPACITY)
         self._measured = 0
-        self._late_count = self._good_count = 0
+        self._late_count = 0
         self.late_s = 0.0
-        """Latency of the last of three answers that were late by more than `MAX_LATENCY_S` for certain [s]; else 0."""
+        """Latency of the last three answers, when each was above `MAX_LATENCY_S` for certain [s]; otherwise 0."""
 
     @property
     def unanswered(self) -> int:
@@ -70,8 +69,8 @@ class CommandPacer:
         if len(self._unanswered) < MAX_UNANSWERED:
             return True
         quiet_s = now_s - self._active_s
-        if self._answered_since_sent and quiet_s >= _QUIET_S:
-            self._missing_s.extend(sent_s for _, sent_s in self._unanswered)
+        late_s = max(self._recent_s)
+        if self._answered_since_sent and quiet_s >= (_QUIET_S if late_s < MAX_LATENCY_S else 1.2 * late_s):
             self.forget()
             return True
         # Without any answer the controller is busy, gone, or everything was lost: probe at growing intervals, since a
@@ -103,27 +102,17 @@ class CommandPacer:
             empty_s: last time before at which the socket was empty [s]: the answer came after it.
         """
         self._active_s, self._answered_since_sent, self._probe_s = now_s, True, _QUIET_S
-        if self._unanswered:
-            self.answered, sent_s = self._unanswered.popleft()
-            self._ring_ms[self._measured % _CAPACITY] = 1e3 * (now_s - sent_s)
-            self._measured += 1
-        else:
-            while self._missing_s and now_s - self._missing_s[0] > _MAX_LATE_S:
-                self._missing_s.popleft()
-            if not self._missing_s:
-                self.unsolicited += 1
-                return
-            sent_s = self._missing_s.popleft()
-        self._judge(empty_s - sent_s)  # where this process looked late, only the time in which it looked is certain
-
-    def _judge(self, certain_s: float) -> None:
-        if certain_s > MAX_LATENCY_S:
-            self._late_count, self._good_count = self._late_count + 1, 0
-        else:
-            self._good_count += 1
-            if self._good_count >= _GOOD_COUNT:
-                self._late_count = 0
-        self.late_s = certain_s if self._late_count >= _LATE_COUNT and not self._good_count else 0.0
+        if not self._unanswered:
+            self.unsolicited += 1
+            return
+        self.answered, sent_s = self._unanswered.popleft()
+        self._ring_ms[self._measured % _CAPACITY] = 1e3 * (now_s - sent_s)
+        self._measured += 1
+        # Where this process was late to look, only the time until it last looked in vain is the controller's.
+        certain_s = empty_s - sent_s
+        self._recent_s.append(certain_s)
+        self._late_count = self._late_count + 1 if certain_s > MAX_LATENCY_S else 0
+        self.late_s = certain_s if self._late_count >= _LATE_COUNT else 0.0
 
     def summary(self) -> LatencySummary:
         """Return percentiles of the latency over the last half minute."""

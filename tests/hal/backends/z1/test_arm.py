@@ -506,8 +506,8 @@ def test_the_arm_follows_over_a_bad_network(mode: Z1Mode) -> None:
         bench.tick(goal)
         assert abs(bench.peer.q[0] - goal[0]) < 0.05
     counts = bench.arm.diagnostics().counts
-    assert counts.invalid > 50
-    assert counts.answers > 2000
+    assert counts.invalid > 20
+    assert counts.answers > 1200
     assert bench.peer.invalid_datagrams > 50
     assert all(fault.startswith("joint") for fault in bench.arm.read_state().faults)
 
@@ -523,7 +523,7 @@ def test_a_hostile_network_raises_only_known_errors() -> None:
             bench.tick(q)
         except (HalTimeoutError, CommandRejectedError):
             bench.clock.advance(PERIOD_S)
-    assert bench.arm.diagnostics().counts.invalid > 50
+    assert bench.arm.diagnostics().counts.invalid > 20
     assert np.abs(bench.peer.q - q).max() < 0.5
 
 
