@@ -6,6 +6,7 @@ come. Only a request that was seen can be refused; one that is late is awaited, 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -27,9 +28,11 @@ _TRIES = 3  # in case a request or its answer is lost
 # The controller may be busy, as while it plans a path (0.3 s): a request in its socket is late, not refused.
 _UNSEEN_S = 2.0
 _MIN_ANSWERS = 10  # after the request's own, before it counts as refused
-# A motion that is not possible shows for one cycle (measured); two more in case an answer is doubled.
-_SHOWN = 3
-_STARTED = 8
+# The controller's states change every 4 ms, by the newest command at that time: three, 2 ms apart, cannot be missed.
+_REPEATS = 3
+# A motion that is not possible shows for one cycle (measured), one that is for 0.17 s and more.
+_STARTED = 20
+_ENDED = 10
 _MOVING_RAD_S = 0.05
 _CALIBRATED_RAD = 0.05
 
@@ -146,12 +149,14 @@ class StateRequester:
         self.last = request = StateRequest(state=Fsm.CALIBRATION, asked_s=client.clock.now_s())
         client.settle()
         client.visited.clear()
-        client.send(encode_command(Fsm.CALIBRATION, client.posture()))
+        first = client.pacer.sent
+        packed = encode_command(Fsm.CALIBRATION, client.posture())
+        client.exchange_until(lambda: client.pacer.sent >= first + _REPEATS, timeout_s, packed)
         request.number = client.pacer.sent
 
         def is_zero() -> bool:
             q = client.newest.joints.q[: z1.N_ARM]
-            seen = client.pacer.answered >= request.number and len(client.visited) > _SHOWN
+            seen = client.pacer.answered >= request.number and len(client.visited) > _REPEATS
             return seen and client.newest.state is Fsm.PASSIVE and bool(np.abs(q).max() < _CALIBRATED_RAD)
 
         if not client.exchange_until(is_zero, timeout_s):
@@ -166,31 +171,40 @@ class StateRequester:
     # --- Inside -------------------------------------------------------------------------------------------------
 
     def _ask(self, request: StateRequest, body: JointCommands | TrajectoryCommand | str, timeout_s: float) -> bool:
-        """Send the request once; return whether its state showed within `timeout_s` after it was seen."""
+        """Send the request; return whether its state showed within `timeout_s` after it was seen."""
         client, clock = self._client, self._client.clock
         client.visited.clear()
         client.carries_joints = isinstance(body, JointCommands)
         client.command.data[:] = encode_command(Fsm.INVALID, body)  # harmless before, and the same afterwards
-        client.send(encode_command(request.state, body))
-        request.number, asked_s = client.pacer.sent, clock.now_s()
+        packed, asked_s = encode_command(request.state, body), clock.now_s()
+        request.phase, request.number, left = RequestPhase.ASKED, 0, _REPEATS
+
+        def exchange_until(reached: Callable[[], bool], duration_s: float) -> bool:
+            nonlocal left
+            end_s = clock.now_s() + duration_s
+            while clock.now_s() < end_s:
+                if client.exchange_until(reached, z1.CONTROL_PERIOD_S, packed if left else None):
+                    return True
+                if left and client.pacer.sent > request.number:
+                    left, request.number = left - 1, client.pacer.sent
+            return False
 
         def has_effect() -> bool:
-            if request.phase is RequestPhase.ASKED and client.pacer.answered >= request.number:
+            if not left and request.phase is RequestPhase.ASKED and client.pacer.answered >= request.number:
                 request.phase = RequestPhase.SEEN
             return request.state in client.visited
 
-        request.phase = RequestPhase.ASKED
-        if not client.exchange_until(lambda: has_effect() or request.phase is RequestPhase.SEEN, _UNSEEN_S):
+        if not exchange_until(lambda: has_effect() or request.phase is RequestPhase.SEEN, _UNSEEN_S):
             raise HalTimeoutError(
                 f"Z1: the controller at {client.link.describe()} has not read a request for {request.state.name} for "
                 f"{clock.now_s() - asked_s:.1f} s. It was taken back; a controller that is only busy may still begin "
                 f"it. Keep away from the arm, and restart `z1_ctrl` if it stays silent.",
                 code="request_unseen",
             )
-        if has_effect() or client.exchange_until(has_effect, timeout_s):
+        if has_effect() or exchange_until(has_effect, timeout_s):
             return True
         while len(client.visited) < _MIN_ANSWERS and clock.now_s() - client.newest_s < _UNSEEN_S:
-            if client.exchange_until(has_effect, timeout_s):
+            if exchange_until(has_effect, timeout_s):
                 return True
         return False
 
@@ -200,15 +214,16 @@ class StateRequester:
         Raises:
             CommandRejectedError: it was refused.
         """
-        client = self._client
+        client, ended = self._client, 0
 
-        def shown() -> int:
-            return sum(state is request.state for state in client.visited)
+        def is_decided() -> bool:
+            nonlocal ended
+            newest = list(client.visited)
+            ended = next((i for i, state in enumerate(reversed(newest)) if state is request.state), len(newest))
+            return ended >= _ENDED or newest[-_STARTED:].count(request.state) == _STARTED
 
-        client.exchange_until(
-            lambda: shown() >= _STARTED or client.newest.state is not request.state, _STARTED * z1.CONTROL_PERIOD_S * 4
-        )
-        if client.newest.state is not request.state and shown() <= _SHOWN and self._speed() < _MOVING_RAD_S:
+        client.exchange_until(is_decided, _UNSEEN_S)
+        if ended >= _ENDED and self._speed() < _MOVING_RAD_S:
             raise self._refuse(request)
 
     def _refuse(self, request: StateRequest) -> CommandRejectedError:
@@ -241,8 +256,9 @@ class StateRequester:
         request.phase = RequestPhase.RETRACTED
         if request.number:
             back = Fsm.PASSIVE if present is Fsm.PASSIVE else Fsm.JOINTCTRL
-            client.pacer.forget()  # it must leave now, whatever is unanswered
-            client.send(encode_command(back, client.posture()))
+            for _ in range(_REPEATS):
+                client.pacer.forget()  # it must leave now, whatever is unanswered
+                client.send(encode_command(back, client.posture()))
 
     def _speed(self) -> float:
         return float(np.abs(self._client.newest.joints.dq[: z1.N_ARM]).max())
