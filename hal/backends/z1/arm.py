@@ -14,12 +14,13 @@ from hal.backends.z1.client import Z1Client
 from hal.backends.z1.command_writer import CommandWriter
 from hal.backends.z1.config import Z1ArmConfig, Z1Diagnostics, Z1Mode
 from hal.backends.z1.faults import motor_values
+from hal.backends.z1.keeper.owner import KeeperOwner, take_over
 from hal.backends.z1.mode_machine import ModeMachine
 from hal.backends.z1.motions import MOVE_TIMEOUT_S, ControllerMotions
 from hal.backends.z1.pacing import LatencySummary
 from hal.backends.z1.requests import StateRequester
 from hal.base.clock import Clock, WallClock
-from hal.base.errors import CommandRejectedError, HalError
+from hal.base.errors import CommandRejectedError, HalError, HalTimeoutError
 from hal.base.messages import ArmSetpoint, ArmState
 from hal.servo.limits import ServoLimits
 from hal.z1_protocol.controller import ControllerState, TrajectoryCommand
@@ -31,6 +32,7 @@ log = logging.getLogger(__name__)
 
 # Ten periods without a command or a look into the socket: its answers are outdated, and new ones have to be asked for.
 _QUIET_S = 0.02
+_KEEPER_START_S = 30.0
 
 
 class Z1Arm:
@@ -58,9 +60,11 @@ class Z1Arm:
         self.clock = clock or WallClock()
         self.config = config or Z1ArmConfig()
         self.limits = limits or ServoLimits()
+        self._keeper: KeeperOwner | None = None
         if link is None:
             c = self.config
             link = UdpLink((c.host, c.command_port), (c.local_host, c.state_port))
+            self._keeper = KeeperOwner((c.local_host, c.state_port))
         self._lock = RLock()
         self._client = Z1Client(link, self.clock)
         self._commands = CommandWriter(self._client, self.limits)
@@ -82,13 +86,16 @@ class Z1Arm:
             if self._modes.mode is not None:
                 return
             client = self._client
+            if self._keeper is not None:
+                take_over((self.config.local_host, self.config.state_port))
             client.open(self.config.connect_timeout_s)
             found = client.newest.state
             self._commands.grip_nm = None  # torque control of an earlier connection must not persist
             try:
+                self._start_keeper()
                 self._modes.start(self.config.mode)
             except HalError:
-                client.close()
+                self._close()
                 raise
             log.info("Z1: connected to %s, which was in %s", client.link.describe(), found.name)
 
@@ -100,7 +107,28 @@ class Z1Arm:
                 self._modes.leave()
             except HalError as error:
                 log.warning("Z1: disconnected without an answer: %s", error)
-            self._client.close()
+            self._close()
+
+    def _start_keeper(self) -> None:
+        fd = self._client.link.fileno()
+        if self._keeper is None or fd is None:
+            return
+        self._keeper.start(fd)
+        self._client.publish = self._keeper.record
+        # The controller must not wait for the start of a process.
+        if not self._client.exchange_until(self._keeper.is_ready, _KEEPER_START_S):
+            raise HalTimeoutError(
+                f"Z1: the keeper's process is not ready after {_KEEPER_START_S:.0f} s. End other programs on this "
+                f"machine, then connect again.",
+                code="keeper_failed",
+            )
+
+    def _close(self) -> None:
+        """Close the link; the keeper holds an arm that is not limp."""
+        self._client.publish = None
+        if self._keeper is not None:
+            self._keeper.stop(hold=self._client.newest.state is not Fsm.PASSIVE)
+        self._client.close()
 
     # --- The contract -------------------------------------------------------------------------------------------
 

@@ -15,14 +15,12 @@ import numpy as np
 
 from hal.backends.z1.faults import FaultLatch
 from hal.backends.z1.pacing import MAX_LATENCY_S, CommandPacer
-from hal.base import z1
+from hal.backends.z1.posture import compute_posture
 from hal.base.clock import Clock
 from hal.base.errors import CommandRejectedError, HalTimeoutError
 from hal.base.z1 import CONTROL_PERIOD_S, DQ_MAX
 from hal.z1_protocol.controller import (
-    KD_JOINTCTRL,
     KD_LOWCMD,
-    KP_JOINTCTRL,
     WATCHDOG_S,
     CommandBuffer,
     ControllerState,
@@ -46,13 +44,8 @@ _JUMP_SPEED = 3.0 * float(DQ_MAX.max())
 _LEFT_COUNT = 3
 _MAX_VISITED = 256
 _MAX_REASON_CHARS = 200
-# A command further from the measurement than this is no posture of the arm, but one that it is kept from [rad].
-_HELD_RAD = 0.05
 _SETTLE_S = 0.1
 _BLAME_S = 1.0  # a fall to PASSIVE so soon after a silence of this process is its consequence
-_GRIPPER = z1.N_ARM
-# Friction keeps a free jaw within this torque [Nm]; more is the grip on an object.
-_FREE_JAW_NM = 0.3
 
 
 @dataclass(slots=True, kw_only=True)
@@ -131,6 +124,7 @@ class Z1Client:
         self.command.joints[:] = 0
         self.command.joints["kd"] = KD_LOWCMD
         if self.exchange_until(lambda: self._newest is not None, timeout_s):
+            self.write_joints(self.posture(), track=False)
             return
         peer = self.link.describe()
         self.link.close()
@@ -275,24 +269,10 @@ class Z1Client:
     # --- Posture ----------------------------------------------------------------------------------------------------
 
     def posture(self) -> JointCommands:
-        """Return the present posture as motor commands that go on as JOINTCTRL would: its gains, and the torques now.
-
-        Of the arm's joints it is the position commanded, where the arm is close to it, and else the measured one; the
-        jaw's is ahead of the measurement by as much as its torque needs, so that it keeps its grip.
-        """
-        measured, command = self.newest.joints, self.command.joints
-        q = measured.q.copy()
-        if self.carries_joints:
-            held = (command["kp"] > 0.0) & (np.abs(command["q"] - q) < _HELD_RAD)
-            held[_GRIPPER] = False
-            q[held] = command["q"][held]
-        tau = np.clip(measured.tau, -z1.TAU_MAX, z1.TAU_MAX)
-        grip_nm = float(tau[_GRIPPER])
-        if abs(grip_nm) > _FREE_JAW_NM:
-            q[_GRIPPER] += grip_nm / z1.KP[_GRIPPER]
-        tau[_GRIPPER] = 0.0
-        q = np.clip(q, z1.Q_MIN, z1.Q_MAX)
-        return JointCommands(q=q, tau=tau, kp=KP_JOINTCTRL, kd=KD_JOINTCTRL)
+        """Return the present posture as motor commands; see `hal.backends.z1.posture`."""
+        joints = self.command.joints
+        known = self.carries_joints
+        return compute_posture(self.newest.joints, joints["q"] if known else None, joints["kp"] if known else None)
 
     def write_joints(self, commands: JointCommands, *, track: bool) -> None:
         """Write seven joints' commands into `command`, as a tracking target or not."""

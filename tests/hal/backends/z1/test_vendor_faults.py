@@ -64,7 +64,6 @@ def test_the_commands_never_queue_up(mode: Z1Mode) -> None:
     assert bench.twin.port.dropped == 0
 
 
-@pytest.mark.xfail(strict=True, reason="the driver has no keep-alive of its own")
 @pytest.mark.integration
 def test_an_idle_owner_does_not_let_the_arm_sink() -> None:
     """The controller goes to PASSIVE after 2.2 s without a datagram, as while a program loads."""
