@@ -31,6 +31,8 @@ COMMAND_PORT = 8071
 """Bound by the controller."""
 STATE_PORT = 8072
 """Bound by the client; a second arm has another pair."""
+WATCHDOG_S = 2.2
+"""Silence of the client [s] after which the controller falls to PASSIVE, and the arm sinks (measured)."""
 COMMAND_SIZE = 147
 STATE_SIZE = 208
 
@@ -49,8 +51,11 @@ KD_PASSIVE = np.array([10.0, 100.0, 300.0, 10.0, 10.0, 10.0, 0.0])
 LABELS = {
     "forward": np.array([0.0, 1.5, -1.0, -0.54, 0.0, 0.0]),
     "startFlat": np.array([0.0, 0.0, -0.005, -0.074, 0.0, 0.0]),
+    "show_left": np.array([-1.0, 0.9, -1.0, -0.3, 0.0, 0.0]),
+    "show_mid": np.array([0.0, 0.9, -1.2, 0.25, 0.0, 0.0]),
+    "show_right": np.array([1.0, 0.9, -1.0, -0.3, 0.0, 0.0]),
 }
-"""Saved labels whose joints (6,) are known [rad]; `show_left`, `show_mid` and `show_right` are saved as well."""
+"""Labels (6,) that the controller has from the start [rad]."""
 for _constant in (KP_LOWCMD, KD_LOWCMD, KP_JOINTCTRL, KD_JOINTCTRL, KD_PASSIVE, *LABELS.values()):
     _constant.setflags(write=False)
 
@@ -60,7 +65,8 @@ _COMMAND_HEAD = struct.Struct("<2siB")
 _STATE_HEAD = struct.Struct("<2si")
 _POSE = struct.Struct("<6d")
 _TRAJECTORY = struct.Struct("<i12d3di")  # 128 of the 140 bytes; the rest is unused
-_BODY_SIZE = COMMAND_SIZE - _COMMAND_HEAD.size
+BODY_SIZE = COMMAND_SIZE - _COMMAND_HEAD.size
+"""Bytes of a command after its head, whose meaning depends on the state."""
 _JOINTS_AT = _STATE_HEAD.size
 _POSE_AT = _JOINTS_AT + z1.N_JOINTS * JOINT_STATE.itemsize
 _LABEL_SIZE = 10  # `char name[10]`, without a terminating zero at full length
@@ -132,7 +138,7 @@ class Command:
             ProtocolError: not 1 to 10 printable ASCII characters.
         """
         name = self.body[:_LABEL_SIZE].split(b"\0", 1)[0]
-        if not name or not all(0x20 < byte < 0x7F for byte in name):
+        if not name or name[0] == 0x20 or not all(0x20 <= byte < 0x7F for byte in name):
             raise ProtocolError(
                 f"a label is {name!r}; allowed are 1 to {_LABEL_SIZE} printable ASCII characters.", code="label"
             )
@@ -182,24 +188,26 @@ def encode_command(
             packed = pack_commands(body).tobytes()
         case TrajectoryCommand():
             packed = _pack_trajectory(body)
-    if len(packed) > _BODY_SIZE:
-        raise ProtocolError(f"a command's body has {len(packed)} bytes; allowed are {_BODY_SIZE}.", code="wrong_size")
-    return _COMMAND_HEAD.pack(_HEAD, state, track) + packed.ljust(_BODY_SIZE, b"\0")
+    if len(packed) > BODY_SIZE:
+        raise ProtocolError(f"a command's body has {len(packed)} bytes; allowed are {BODY_SIZE}.", code="wrong_size")
+    return _COMMAND_HEAD.pack(_HEAD, state, track) + packed.ljust(BODY_SIZE, b"\0")
 
 
 def decode_command(data: bytes | memoryview) -> Command:
     """Return the command in a datagram.
 
+    As lenient as the vendor's controller (measured): bytes after the 147th are cut off, every track flag but 0 tracks,
+    and an unknown state requests no change.
+
     Raises:
-        ProtocolError: wrong size, head, state or flag.
+        ProtocolError: too short, or another head.
     """
-    # Stricter than the vendor's controller, which obeys commands of 148 B and a track flag of 2 as well (measured).
-    _check_size(data, COMMAND_SIZE, "a command")
+    if len(data) < COMMAND_SIZE:
+        raise ProtocolError(f"a command has {len(data)} bytes; allowed are {COMMAND_SIZE} or more.", code="wrong_size")
     head, state, track = _COMMAND_HEAD.unpack_from(data)
-    _check_head(head, state)
-    if track > 1:
-        raise ProtocolError(f"a command's track flag is {track}; allowed are 0 and 1.", code="track_flag")
-    return Command(state=Fsm(state), track=bool(track), body=bytes(data[_COMMAND_HEAD.size :]))
+    _check_head(head)
+    body = bytes(data[_COMMAND_HEAD.size : COMMAND_SIZE])
+    return Command(state=Fsm(state) if state in _STATES else Fsm.INVALID, track=bool(track), body=body)
 
 
 def encode_state(state: ControllerState) -> bytes:
@@ -224,7 +232,9 @@ def decode_state(data: bytes | memoryview) -> ControllerState:
     """
     _check_size(data, STATE_SIZE, "a state")
     head, state = _STATE_HEAD.unpack_from(data)
-    _check_head(head, state)
+    _check_head(head)
+    if state not in _STATES:
+        raise ProtocolError(f"a datagram has state {state}; allowed are 0 to {max(_STATES)}.", code="unknown_state")
     pose = np.array(_POSE.unpack_from(data, _POSE_AT))
     if not (np.abs(pose) <= _MAX_POSE).all():  # true for a NaN, too
         raise ProtocolError(
@@ -236,7 +246,7 @@ def decode_state(data: bytes | memoryview) -> ControllerState:
 
 def _pack_label(label: str) -> bytes:
     packed = label.encode("ascii", "replace")  # `isascii` below rejects the replaced ones
-    if not 1 <= len(packed) <= _LABEL_SIZE or not label.isascii() or not label.isprintable() or " " in label:
+    if not 1 <= len(packed) <= _LABEL_SIZE or not label.isascii() or not label.isprintable():
         raise ProtocolError(
             f"the label {label!r} cannot be sent; allowed are 1 to {_LABEL_SIZE} printable ASCII characters.",
             code="label",
@@ -256,8 +266,6 @@ def _check_size(data: bytes | memoryview, size: int, name: str) -> None:
         raise ProtocolError(f"{name} has {len(data)} bytes; allowed are {size}.", code="wrong_size")
 
 
-def _check_head(head: bytes, state: int) -> None:
+def _check_head(head: bytes) -> None:
     if head != _HEAD:
         raise ProtocolError(f"a datagram begins with {head.hex()}; allowed is {_HEAD.hex()}.", code="wrong_head")
-    if state not in _STATES:
-        raise ProtocolError(f"a datagram has state {state}; allowed are 0 to {max(_STATES)}.", code="unknown_state")

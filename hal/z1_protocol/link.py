@@ -41,6 +41,10 @@ class DatagramLink(Protocol):
         """Return the peer's address and the last failure of the link, as text."""
         ...
 
+    def fileno(self) -> int | None:
+        """Return the descriptor of the open socket; None without one."""
+        ...
+
 
 class UdpLink:
     """A UDP socket connected to its peer: the kernel drops the datagrams of all others.
@@ -103,6 +107,9 @@ class UdpLink:
     def describe(self) -> str:
         return f"{_join(self._remote)} (answers to {_join(self._local)}){self._failure}"
 
+    def fileno(self) -> int | None:
+        return None if self._socket is None else self._socket.fileno()
+
     def _record(self, error: OSError) -> None:
         # On a connected UDP socket this is the peer's ICMP message "port unreachable".
         if error.errno == errno.ECONNREFUSED:
@@ -126,3 +133,16 @@ class UdpLink:
 
 def _join(address: tuple[str, int]) -> str:
     return f"{address[0]}:{address[1]}"
+
+
+class SharedLink(UdpLink):
+    """The open UDP socket of another process, by its inherited descriptor.
+
+    Args:
+        fd: descriptor of the socket, which is connected to its peer.
+    """
+
+    def __init__(self, fd: int) -> None:
+        shared = socket.socket(fileno=fd)
+        super().__init__(shared.getpeername(), shared.getsockname())
+        self._socket = shared

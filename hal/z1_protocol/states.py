@@ -15,11 +15,12 @@ class Fsm(IntEnum):
     JOINTCTRL = 2
     """Holds, or tracks joint positions while `track` is set."""
     CARTESIAN = 3
-    """Holds, or tracks a pose while `track` is set."""
+    """Holds, or follows a twist while `track` is set."""
     MOVEJ = 4
     MOVEL = 5
     MOVEC = 6
     TRAJECTORY = 7
+    """Runs a built-in demonstration, over and over."""
     TOSTATE = 8
     """Moves to a saved label."""
     SAVESTATE = 9
@@ -29,10 +30,13 @@ class Fsm(IntEnum):
     TEACHREPEAT = 11
     """Plays such a recording."""
     CALIBRATION = 12
+    """Makes the present pose the zero of the joints."""
     SETTRAJ = 13
+    """Without effect."""
     BACKTOSTART = 14
     """Moves to `startFlat`."""
     NEXT = 15
+    """Ends TRAJECTORY by BACKTOSTART."""
     LOWCMD = 16
     """Forwards torques, positions and gains to the motors."""
 
@@ -51,27 +55,29 @@ MOVES = frozenset(
 )
 """States in which the controller moves (or saves) by itself; done, it falls back to JOINTCTRL."""
 
-# Measured: MOVEJ is ignored in PASSIVE, and LOWCMD is granted there alone.
-_FROM_PASSIVE = {Fsm.JOINTCTRL, Fsm.CARTESIAN, Fsm.BACKTOSTART, Fsm.LOWCMD, Fsm.CALIBRATION}
-_FROM_LOWCMD = {Fsm.JOINTCTRL, Fsm.PASSIVE}
-_FROM_MOVING = {Fsm.JOINTCTRL, Fsm.PASSIVE}
-_FROM_HOLDING = MOVES | {Fsm.PASSIVE, Fsm.JOINTCTRL, Fsm.CARTESIAN, Fsm.TEACH, Fsm.SETTRAJ}
+_HOMING = frozenset({Fsm.PASSIVE, Fsm.JOINTCTRL, Fsm.BACKTOSTART})
+_CARTESIAN_MOVES = frozenset({Fsm.MOVEJ, Fsm.MOVEL, Fsm.MOVEC})
+_FROM_CARTESIAN_MOVE = _HOMING | _CARTESIAN_MOVES | {Fsm.CARTESIAN, Fsm.SAVESTATE}
+_NONE: frozenset[Fsm] = frozenset()
+# Every pair was tried on the vendor's controller. A replayed lesson cannot be interrupted, not even by PASSIVE.
+_GRANTED = {
+    Fsm.PASSIVE: frozenset({Fsm.JOINTCTRL, Fsm.CARTESIAN, Fsm.BACKTOSTART, Fsm.LOWCMD, Fsm.CALIBRATION}),
+    Fsm.JOINTCTRL: MOVES | {Fsm.PASSIVE, Fsm.CARTESIAN, Fsm.TEACH},
+    Fsm.CARTESIAN: _HOMING | _CARTESIAN_MOVES | {Fsm.TOSTATE, Fsm.SAVESTATE},
+    Fsm.MOVEJ: _FROM_CARTESIAN_MOVE,
+    Fsm.MOVEL: _FROM_CARTESIAN_MOVE,
+    Fsm.MOVEC: _FROM_CARTESIAN_MOVE,
+    Fsm.TRAJECTORY: _HOMING | {Fsm.NEXT},
+    Fsm.TOSTATE: _HOMING,
+    Fsm.TEACH: _HOMING,
+    Fsm.BACKTOSTART: _HOMING,
+    Fsm.LOWCMD: _HOMING,
+}
 
 
 def is_granted(present: Fsm, requested: Fsm) -> bool:
     """Return whether the controller, in state `present`, grants a request for `requested`; else it ignores it.
 
-    Measured on the vendor's controller: everything about PASSIVE and LOWCMD, and that moves start from JOINTCTRL.
-    Assumed from the vendor's examples: moves from CARTESIAN, and JOINTCTRL or PASSIVE out of a move or a teaching.
+    Measured on the vendor's controller, every pair. NEXT during TRAJECTORY acts as BACKTOSTART.
     """
-    if requested in (present, Fsm.INVALID):
-        return True
-    match present:
-        case Fsm.PASSIVE:
-            return requested in _FROM_PASSIVE
-        case Fsm.LOWCMD:
-            return requested in _FROM_LOWCMD
-        case Fsm.JOINTCTRL | Fsm.CARTESIAN:
-            return requested in _FROM_HOLDING
-        case _:
-            return requested in _FROM_MOVING
+    return requested in (present, Fsm.INVALID) or requested in _GRANTED.get(present, _NONE)

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Protocol, Self
 from hal.base.clock import Clock, WallClock
 from hal.base.errors import HalError, LeaseError
 from hal.base.z1 import CONTROL_PERIOD_S
-from hal.z1_protocol.motor_board import PERIOD_S
 from sim_twin.drop_in.config import WireConfig
 
 if TYPE_CHECKING:
@@ -27,8 +26,6 @@ log = logging.getLogger(__name__)
 _FIFO_PRIORITY = 70  # below the servo's thread, which waits for the answers
 _MAX_CATCH_UP_S = 0.020
 _MAX_DATAGRAMS = 1024
-# The controller exchanges nothing with the motors in between, and every wake-up costs more than a step.
-_STEPS_PER_WAKE = {"controller": round(PERIOD_S / CONTROL_PERIOD_S), "board": 1}
 _MAX_DATAGRAM = 2048  # ten times the largest valid one
 
 
@@ -37,13 +34,19 @@ class ArmEndpoint(Protocol):
     `sim_twin.controller`."""
 
     world: World
-    invalid_datagrams: int
-    """Datagrams that could not be decoded."""
-    invalid_reason: str
-    """Reason for the last one."""
+
+    @property
+    def invalid_datagrams(self) -> int:
+        """Datagrams that could not be decoded."""
+        ...
+
+    @property
+    def invalid_reason(self) -> str:
+        """Reason for the last one."""
+        ...
 
     def receive(self, data: bytes | memoryview) -> bytes | None:
-        """Process a datagram; return the immediate answer to its sender, if any. Never raises."""
+        """Process or queue a datagram; return the immediate answer to its sender, if any. Never raises."""
         ...
 
     def tick(self) -> None:
@@ -59,14 +62,14 @@ class WireServer:
     """Server thread that receives commands, steps the world and answers every 2 ms; a context manager.
 
     As the vendor's it has no access control. The controller answers to one address only, which a second client cannot
-    have, in those of its periods in which a command was received; the motor board answers every single datagram at
-    once. Without a client the arm follows its last command. Invalid datagrams are counted and dropped.
+    have, once a cycle while datagrams arrive, and at 10 Hz without any; the motor board answers every single datagram
+    at once. Invalid datagrams are counted.
 
     Args:
         twin: arm behind the protocol.
         config: addresses.
         clock: the wall clock.
-        on_step: called after each advance of the world, of 4 ms at most.
+        on_step: called after each step of the world.
     """
 
     def __init__(
@@ -159,24 +162,20 @@ class WireServer:
             log.exception("the twin's %s failed", self.config.depth)
 
     def _serve(self, inlet: socket.socket) -> None:
-        deadline_s, due_steps = self._clock.now_s(), 0
+        deadline_s = self._clock.now_s()
         client = (self.config.client_host, self.config.state_port)
         while not self._end.is_set():
             self._receive_until(inlet, deadline_s)
             late_s = self._clock.now_s() - deadline_s
             # A delay beyond the limit is dropped: the world then slows down, and never bursts.
             deadline_s += CONTROL_PERIOD_S + max(late_s - _MAX_CATCH_UP_S, 0.0)
-            due_steps += 1
-            if due_steps == _STEPS_PER_WAKE[self.config.depth]:
-                for _ in range(due_steps):
-                    self.twin.tick()
-                    self.twin.world.step()
-                due_steps = 0
-                self._on_step()
+            self.twin.tick()
             self._send(inlet, self.twin.reply(), client)
+            self.twin.world.step()
+            self._on_step()
 
     def _receive_until(self, inlet: socket.socket, until_s: float) -> None:
-        if self.config.depth == "controller":  # datagrams received meanwhile are answered afterwards anyway
+        if self.config.depth == "controller":  # it reads its queue in its next cycle only
             self._clock.sleep_until(until_s)
         while (left_s := until_s - self._clock.now_s()) > 0.0:
             if select.select([inlet], [], [], left_s)[0]:

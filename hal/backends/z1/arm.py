@@ -14,10 +14,13 @@ from hal.backends.z1.client import Z1Client
 from hal.backends.z1.command_writer import CommandWriter
 from hal.backends.z1.config import Z1ArmConfig, Z1Diagnostics, Z1Mode
 from hal.backends.z1.faults import motor_values
+from hal.backends.z1.keeper.owner import KeeperOwner, take_over
 from hal.backends.z1.mode_machine import ModeMachine
 from hal.backends.z1.motions import MOVE_TIMEOUT_S, ControllerMotions
+from hal.backends.z1.pacing import LatencySummary
+from hal.backends.z1.requests import StateRequester
 from hal.base.clock import Clock, WallClock
-from hal.base.errors import CommandRejectedError, HalError
+from hal.base.errors import CommandRejectedError, HalError, HalTimeoutError
 from hal.base.messages import ArmSetpoint, ArmState
 from hal.servo.limits import ServoLimits
 from hal.z1_protocol.controller import ControllerState, TrajectoryCommand
@@ -27,8 +30,9 @@ from hal.z1_protocol.states import Fsm
 
 log = logging.getLogger(__name__)
 
-# After a pause in sending of more than this the answers in the socket are outdated [s]: two and a half periods.
-_QUIET_S = 0.005
+# Ten periods without a command or a look into the socket: its answers are outdated, and new ones have to be asked for.
+_QUIET_S = 0.02
+_KEEPER_START_S = 30.0
 
 
 class Z1Arm:
@@ -56,14 +60,17 @@ class Z1Arm:
         self.clock = clock or WallClock()
         self.config = config or Z1ArmConfig()
         self.limits = limits or ServoLimits()
+        self._keeper: KeeperOwner | None = None
         if link is None:
             c = self.config
             link = UdpLink((c.host, c.command_port), (c.local_host, c.state_port))
+            self._keeper = KeeperOwner((c.local_host, c.state_port))
         self._lock = RLock()
         self._client = Z1Client(link, self.clock)
         self._commands = CommandWriter(self._client, self.limits)
-        self._modes = ModeMachine(self._client, self._commands, self.config.connect_timeout_s)
-        self._motions = ControllerMotions(self._client, self._modes, self._lock)
+        self._requests = StateRequester(self._client)
+        self._modes = ModeMachine(self._client, self._requests, self._commands, self.config.connect_timeout_s)
+        self._motions = ControllerMotions(self._client, self._requests, self._modes, self._lock)
 
     # --- Connection ---------------------------------------------------------------------------------------------
 
@@ -79,13 +86,16 @@ class Z1Arm:
             if self._modes.mode is not None:
                 return
             client = self._client
+            if self._keeper is not None:
+                take_over((self.config.local_host, self.config.state_port))
             client.open(self.config.connect_timeout_s)
             found = client.newest.state
             self._commands.grip_nm = None  # torque control of an earlier connection must not persist
             try:
+                self._start_keeper()
                 self._modes.start(self.config.mode)
             except HalError:
-                client.close()
+                self._close()
                 raise
             log.info("Z1: connected to %s, which was in %s", client.link.describe(), found.name)
 
@@ -97,16 +107,39 @@ class Z1Arm:
                 self._modes.leave()
             except HalError as error:
                 log.warning("Z1: disconnected without an answer: %s", error)
-            self._client.close()
+            self._close()
+
+    def _start_keeper(self) -> None:
+        fd = self._client.link.fileno()
+        if self._keeper is None or fd is None:
+            return
+        self._keeper.start(fd)
+        self._client.publish = self._keeper.record
+        # The controller must not wait for the start of a process.
+        if not self._client.exchange_until(self._keeper.is_ready, _KEEPER_START_S):
+            raise HalTimeoutError(
+                f"Z1: the keeper's process is not ready after {_KEEPER_START_S:.0f} s. End other programs on this "
+                f"machine, then connect again.",
+                code="keeper_failed",
+            )
+
+    def _close(self) -> None:
+        """Close the link; the keeper holds an arm that is not limp."""
+        self._client.publish = None
+        if self._keeper is not None:
+            self._keeper.stop(hold=self._client.newest.state is not Fsm.PASSIVE)
+        self._client.close()
 
     # --- The contract -------------------------------------------------------------------------------------------
 
     def read_state(self) -> ArmState:
         with self._lock:
             client = self._modes.require_connection()
-            if self.clock.now_s() - client.sent_s > _QUIET_S:
+            if self.clock.now_s() - client.polled_s > _QUIET_S:
                 self._modes.refresh()
             client.receive()
+            if self.clock.now_s() - client.sent_s > _QUIET_S:
+                self._modes.hold()
             client.check_age()
             if not self._modes.moving:
                 self._commands.check_freshness()
@@ -122,9 +155,9 @@ class Z1Arm:
     def send(self, setpoint: ArmSetpoint) -> ArmSetpoint:
         with self._lock:
             self._modes.require_connection().receive()
-            client = self._modes.require_command_authority()
+            self._modes.require_command_authority()
             applied = self._commands.write_setpoint(setpoint)
-            client.send()
+            self._commands.send()
             return applied
 
     def send_motors(self, commands: JointCommands) -> JointCommands:
@@ -139,14 +172,14 @@ class Z1Arm:
         """
         with self._lock:
             self._modes.require_connection().receive()
-            client = self._modes.require_command_authority()
+            self._modes.require_command_authority()
             if self.mode is not Z1Mode.LOW_LEVEL:
                 raise CommandRejectedError(
                     f"Z1: the arm is in mode {self.mode}; motors are commanded in low_level. Enter it first.",
                     code="wrong_mode",
                 )
             applied = self._commands.write_motor_commands(commands)
-            client.send()
+            self._commands.send()
             return applied
 
     def stop(self) -> None:
@@ -203,7 +236,8 @@ class Z1Arm:
             CommandRejectedError, HalTimeoutError: the controller does not change its state.
         """
         with self._lock:
-            self._modes.require_connection().request_state(Fsm.PASSIVE)
+            self._modes.require_connection()
+            self._requests.request(Fsm.PASSIVE)
             self._modes.observe()
 
     def idle(self) -> None:
@@ -294,9 +328,15 @@ class Z1Arm:
                 faults=client.faults.latched(),
                 answer_age_s=now_s - client.newest_s,
                 unchanged_s=now_s - client.changed_s,
+                latency=client.pacer.summary(),
+                request=self._requests.last,
                 counts=client.counts,
                 invalid_reason=client.invalid_reason,
             )
+
+    def command_latency(self) -> LatencySummary:
+        """Return the time from a command to the controller's answer to it; without the lock, for any thread."""
+        return self._client.pacer.summary()
 
     def clear_faults(self) -> None:
         """Clear the latched faults; those that persist are latched again."""

@@ -13,13 +13,14 @@ from hal.base import z1
 from hal.base.errors import HalTimeoutError
 from hal.base.messages import ArmSetpoint
 from hal.servo.limits import ServoLimits, clip_setpoint
-from hal.z1_protocol.controller import KD_JOINTCTRL, KD_LOWCMD, KP_LOWCMD
+from hal.z1_protocol.controller import KD_JOINTCTRL, KD_LOWCMD, KP_JOINTCTRL, KP_LOWCMD
 from hal.z1_protocol.records import JointCommands
 from hal.z1_protocol.states import Fsm
 
 if TYPE_CHECKING:
     from hal.base.z1_dynamics import FeedForward
 
+_MAX_SKIPPED = 5  # periods of motion in one command; normally one, or two where the controller is the slower one
 _MAX_LEAD_RAD = 0.35  # above the servo's following-error limit, so that the servo reports a blocked arm first
 # The controller repeats its last measurement while its motor board is silent (measured on the vendor's controller).
 _STALE_S = 0.1
@@ -31,7 +32,7 @@ _REST.setflags(write=False)
 
 
 class CommandWriter:
-    """Limits every command and writes it into the client's buffer; it sends nothing, and expects the driver's lock.
+    """Limits every command and writes it into the client's buffer; it expects the driver's lock.
 
     Args:
         client: owner of the command buffer.
@@ -46,19 +47,26 @@ class CommandWriter:
         """Format of the commands written."""
         self.grip_nm: float | None = None
         """Torque of the gripper [Nm]; None = position control."""
-        self.q_sent = self._still_q = _REST
+        self.q_sent = self._still_q = self._q_wire = _REST
         """(7,) last position commanded [rad]."""
         self._still_s = 0.0
 
-    def start_mode(self, mode: Z1Mode) -> None:
-        """Start a mode with the command equal to the measurement."""
-        self.mode = mode
-        self.q_sent = self._still_q = self._client.newest.joints.q
-        self._still_s = self._client.newest_s
+    def prepare(self, mode: Z1Mode) -> None:
+        """Load what a mode needs, which takes a second: never while the arm sinks in PASSIVE."""
         if mode is Z1Mode.LOW_LEVEL and self._feed_forward is None:
             from hal.base.z1_dynamics import FeedForward  # pinocchio is loaded only where torques are needed
 
             self._feed_forward = FeedForward()
+
+    def start_mode(self, mode: Z1Mode) -> None:
+        """Start a mode with the command equal to the measurement; the jaw keeps its grip."""
+        self.prepare(mode)
+        self.mode = mode
+        measured = self._client.newest.joints.q
+        # While tracking, the jaw's torque is that of a target ahead of it; LOWCMD keeps it by `grip_nm`.
+        q = np.append(measured[:_GRIPPER], self._client.posture().q[_GRIPPER])
+        self.q_sent = self._still_q = self._q_wire = q if mode is Z1Mode.TRACKING else measured
+        self._still_s = self._client.newest_s
 
     def write_hold(self) -> None:
         """Write the last position once more, at rest."""
@@ -78,6 +86,9 @@ class CommandWriter:
             q[_GRIPPER], dq[_GRIPPER] = measured[_GRIPPER] + self.grip_nm / z1.KP[_GRIPPER], 0.0
         allowed = clip_setpoint(self._limits, q, dq, q_last=self.q_sent, q_measured=measured, dq_measured=joints.dq)
         q = np.minimum(np.maximum(allowed.q, measured - _MAX_LEAD_RAD), measured + _MAX_LEAD_RAD)
+        # A controller that has no room for commands must not find a leap when it has again.
+        leap = _MAX_SKIPPED * self._limits.dq_max * z1.CONTROL_PERIOD_S
+        q = np.minimum(np.maximum(q, self._q_wire - leap), self._q_wire + leap)
         q, dq = self._write(q, np.where(q == allowed.q, allowed.dq, 0.0))
         self.q_sent = q
         return ArmSetpoint(q=q, dq=dq)
@@ -97,6 +108,11 @@ class CommandWriter:
         """Start the low-level mode and return its first command: the measurement, at rest."""
         self.start_mode(Z1Mode.LOW_LEVEL)
         return self._compensate(self._client.newest.joints.q, _REST)
+
+    def send(self) -> None:
+        """Send the command written last, if the controller has room for it."""
+        if self._client.send():
+            self._q_wire = self.q_sent
 
     def check_freshness(self) -> None:
         """Check that the measurements change while the arm is commanded to move.
@@ -126,18 +142,17 @@ class CommandWriter:
             allowed = self._compensate(q, dq)
             self._write_motors(allowed)
             return allowed.q, allowed.dq
-        joints = self._client.command.joints
-        # While tracking, the controller reads these two alone; gains and gravity torque are its own (measured).
-        joints["q"] = q
-        joints["dq"] = dq
-        self._client.command.set_head(Fsm.INVALID, track=True)
+        client = self._client
+        # While tracking, the controller reads positions and speeds alone (measured). The rest is what keeps the arm
+        # where it is if it has gone to LOWCMD meanwhile; in CARTESIAN a target of joints would be read as a twist.
+        tau = np.minimum(np.maximum(client.newest.joints.tau, -z1.TAU_MAX), z1.TAU_MAX)
+        tau[_GRIPPER] = 0.0
+        commands = JointCommands(q=q, dq=dq, tau=tau, kp=KP_JOINTCTRL, kd=KD_JOINTCTRL)
+        client.write_joints(commands, track=client.newest.state is Fsm.JOINTCTRL)
         return q, dq
 
     def _write_motors(self, commands: JointCommands) -> None:
-        joints = self._client.command.joints
-        for name in ("q", "dq", "tau", "kp", "kd"):
-            joints[name] = getattr(commands, name)
-        self._client.command.set_head(Fsm.INVALID, track=False)
+        self._client.write_joints(commands, track=False)
 
     def _compensate(self, q: np.ndarray, dq: np.ndarray) -> JointCommands:
         """Return the motors' commands for a setpoint: default gains, gravity and friction compensated."""

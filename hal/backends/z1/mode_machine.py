@@ -7,6 +7,7 @@ import numpy as np
 from hal.backends.z1.client import Z1Client
 from hal.backends.z1.command_writer import CommandWriter
 from hal.backends.z1.config import Z1Mode
+from hal.backends.z1.requests import StateRequester
 from hal.base import z1
 from hal.base.errors import CommandRejectedError, HalError, NotConnectedError
 from hal.z1_protocol.states import MOVES, Fsm
@@ -22,8 +23,8 @@ _SETTLE_RAD = 0.05
 # LOWCMD is entered through PASSIVE, where a moving arm would go on moving.
 _REST_SPEED = 0.05
 _REST_WAIT_S = 0.2
-# Timeout of each step through PASSIVE [s]; the controller answers within 2 ms, and the arm sinks meanwhile.
-_ENTRY_S = 0.05
+# Time for each step through PASSIVE once it was seen [s], ten cycles: the arm sinks meanwhile.
+_ENTRY_S = 0.02
 # Ten answer periods a try, and five tries in case single datagrams are lost.
 _REFRESH_WAIT_S = 0.02
 _REFRESH_TRIES = 5
@@ -36,12 +37,16 @@ class ModeMachine:
 
     Args:
         client: connection to the controller.
+        requests: requests of its states.
         commands: writer of the commands.
         move_timeout_s: timeout of a controller motion that is under way when a mode is entered [s].
     """
 
-    def __init__(self, client: Z1Client, commands: CommandWriter, move_timeout_s: float) -> None:
+    def __init__(
+        self, client: Z1Client, requests: StateRequester, commands: CommandWriter, move_timeout_s: float
+    ) -> None:
         self._client = client
+        self._requests = requests
         self._commands = commands
         self._move_timeout_s = move_timeout_s
         self.mode: Z1Mode | None = None
@@ -79,8 +84,8 @@ class ModeMachine:
             raise CommandRejectedError("Z1: the arm is only observed; enter another mode first.", code="observe_only")
         if client.has_left:
             raise CommandRejectedError(
-                f"Z1: the controller is in {client.newest.state.name} instead of {client.expected.name} and does not "
-                f"follow. Another client changed it, or it was restarted: inspect the arm, then connect again.",
+                f"Z1: {client.describe_departure(client.newest.state)}, and does not follow. Inspect the arm, then "
+                f"connect again.",
                 code="controller_left_state",
             )
         return client
@@ -96,7 +101,7 @@ class ModeMachine:
         self.mode, self.moving = Z1Mode.OBSERVE, False
         try:
             if self._client.newest.state is Fsm.LOWCMD:  # left there by another client: every datagram drives motors
-                self._client.request_state(Fsm.JOINTCTRL)
+                self._requests.request(Fsm.JOINTCTRL)
             self.enter(mode)
         except HalError:
             self.mode = None
@@ -110,7 +115,7 @@ class ModeMachine:
         """
         try:
             if self.mode is Z1Mode.LOW_LEVEL:
-                self._client.request_state(Fsm.JOINTCTRL)
+                self._requests.request(Fsm.JOINTCTRL)
             elif self.mode is Z1Mode.TRACKING:
                 self.stop()
         finally:
@@ -120,13 +125,13 @@ class ModeMachine:
         """Enter a mode, in which the arm holds; see `Z1Arm.enter`."""
         client = self.require_connection()
         if client.newest.state in MOVES:
-            client.wait_for_state(Fsm.JOINTCTRL, self._move_timeout_s)
+            self._requests.wait_for_state(Fsm.JOINTCTRL, self._move_timeout_s)
         self.moving = False
         self.observe()
         if mode is Z1Mode.LOW_LEVEL:
             self._enter_low_level()
         elif mode is Z1Mode.TRACKING and client.newest.state is not Fsm.JOINTCTRL:
-            client.request_state(Fsm.JOINTCTRL)
+            self._requests.request(Fsm.JOINTCTRL)
         self.mode = mode
         self.resume()
         if mode is not Z1Mode.OBSERVE:
@@ -161,7 +166,7 @@ class ModeMachine:
             if self.moving:
                 self.moving = False
                 try:
-                    self._client.request_state(Fsm.JOINTCTRL)
+                    self._requests.request(Fsm.JOINTCTRL)
                 finally:
                     self.resume()
         finally:
@@ -173,11 +178,11 @@ class ModeMachine:
         """Send the last command once more, at rest."""
         if not self.moving:
             self._commands.write_hold()
-        self._client.send()
+        self._commands.send()
 
     def refresh(self) -> None:
-        """Exchange datagrams until a new answer arrives: after a pause those in the socket may be of any age."""
-        self._client.discard()
+        """Exchange datagrams until a new answer arrives, after a pause."""
+        self._client.receive()
         for _ in range(_REFRESH_TRIES):
             self.hold()
             if self._client.receive(_REFRESH_WAIT_S):
@@ -192,7 +197,7 @@ class ModeMachine:
             return float(np.abs(client.newest.joints.dq[: z1.N_ARM]).max())
 
         if speed() > _REST_SPEED and client.newest.state is Fsm.PASSIVE:
-            client.request_state(Fsm.JOINTCTRL)  # the arm sinks: catch it first
+            self._requests.request(Fsm.JOINTCTRL)  # the arm sinks: catch it first
         if speed() > _REST_SPEED and not client.exchange_until(lambda: speed() <= _REST_SPEED, _REST_WAIT_S):
             raise CommandRejectedError(
                 f"Z1: the arm moves at {speed():.2f} rad/s; low-level mode is entered at rest (below {_REST_SPEED} "
@@ -202,14 +207,15 @@ class ModeMachine:
         before = client.newest.state
         if before is Fsm.LOWCMD:
             return
+        self._commands.prepare(Z1Mode.LOW_LEVEL)
         try:
-            client.request_state(Fsm.PASSIVE, timeout_s=_ENTRY_S)
-            client.request_state(Fsm.LOWCMD, self._commands.make_entry_command(), timeout_s=_ENTRY_S)
+            self._requests.request(Fsm.PASSIVE, timeout_s=_ENTRY_S)
+            self._requests.request(Fsm.LOWCMD, self._commands.make_entry_command(), timeout_s=_ENTRY_S)
         except HalError:
             self._commands.mode = Z1Mode.OBSERVE
             if before is not Fsm.PASSIVE:
                 client.cancelled = False  # after a stop, too, the arm must not be left sinking
-                client.request_state(Fsm.JOINTCTRL)
+                self._requests.request(Fsm.JOINTCTRL)
             raise
 
     def _settle(self) -> None:
@@ -217,7 +223,7 @@ class ModeMachine:
         end_s = client.clock.now_s() + _SETTLE_S
         while client.clock.now_s() < end_s:
             self.hold()
-            client.clock.sleep_until(client.sent_s + z1.CONTROL_PERIOD_S)
+            client.clock.sleep_until(client.clock.now_s() + z1.CONTROL_PERIOD_S)
             client.receive()
         client.check_age()
         deviation = np.abs(client.newest.joints.q - held)[: z1.N_ARM]
@@ -225,7 +231,7 @@ class ModeMachine:
             return
         worst = int(deviation.argmax())
         if client.newest.state is Fsm.LOWCMD:
-            client.request_state(Fsm.JOINTCTRL)
+            self._requests.request(Fsm.JOINTCTRL)
         self.observe()
         client.expected = None
         raise CommandRejectedError(

@@ -4,13 +4,19 @@ from __future__ import annotations
 
 from threading import RLock
 
+import numpy as np
+
 from hal.backends.z1.client import Z1Client
 from hal.backends.z1.config import Z1Mode
 from hal.backends.z1.mode_machine import ModeMachine
+from hal.backends.z1.requests import StateRequester
 from hal.base import z1
 from hal.base.errors import CommandRejectedError, HalError, HalTimeoutError
 from hal.z1_protocol.controller import TrajectoryCommand
 from hal.z1_protocol.states import MOVES, Fsm
+
+# With three points on a line the controller moves for ever (measured); flat arcs have a radius beyond the arm's reach.
+_MIN_ARC_M = 0.002
 
 MOVE_TIMEOUT_S = 60.0
 """Timeout of one motion [s]; those of the vendor's controller take a few seconds (measured)."""
@@ -21,13 +27,15 @@ class ControllerMotions:
 
     Args:
         client: connection to the controller.
+        requests: requests of its states.
         modes: mode machine, which suspends our commands meanwhile.
         lock: the driver's lock; it is taken here, and released between the steps of a wait, so that other threads
             can read and stop.
     """
 
-    def __init__(self, client: Z1Client, modes: ModeMachine, lock: RLock) -> None:
+    def __init__(self, client: Z1Client, requests: StateRequester, modes: ModeMachine, lock: RLock) -> None:
         self._client = client
+        self._requests = requests
         self._modes = modes
         self._lock = lock
 
@@ -35,14 +43,18 @@ class ControllerMotions:
         """Start a motion; see `Z1Arm.begin_move`."""
         with self._lock:
             client = self._modes.require_command_authority()
-            if self._modes.mode is not Z1Mode.TRACKING:
+            leaves_low_level = state is Fsm.BACKTOSTART and self._modes.mode is Z1Mode.LOW_LEVEL
+            if self._modes.mode is not Z1Mode.TRACKING and not leaves_low_level:
                 raise CommandRejectedError(
                     f"Z1: the arm is in mode {self._modes.mode}; motions of the controller start in tracking.",
                     code="wrong_mode",
                 )
+            if state is Fsm.MOVEC and isinstance(body, TrajectoryCommand):
+                _check_arc(client.newest.pose, body)
             self._modes.suspend()
             try:
-                client.request_state(state, body)
+                self._requests.request(state, body)
+                self._modes.mode = Z1Mode.TRACKING  # where every motion of the controller ends
             except HalError:
                 self._modes.resume()
                 raise
@@ -86,7 +98,24 @@ class ControllerMotions:
     def calibrate(self) -> None:
         """Make the present pose the zero of all joints; see `Z1Arm.calibrate`."""
         with self._lock:
-            self._modes.require_connection().request_state(Fsm.PASSIVE)
+            self._modes.require_connection()
+            self._requests.request(Fsm.PASSIVE)
             self._modes.observe()
-            self._client.request_state(Fsm.CALIBRATION)
-            self._client.wait_for_state(Fsm.PASSIVE, MOVE_TIMEOUT_S)
+            self._requests.calibrate(MOVE_TIMEOUT_S)
+
+
+def _check_arc(pose: np.ndarray, move: TrajectoryCommand) -> None:
+    """Check that the pivot's position and the two of an arc are not on one line.
+
+    Raises:
+        CommandRejectedError: they are (`arc_on_line`).
+    """
+    start, middle, end = pose[3:], *move.poses[:, 3:]
+    longest = max(np.linalg.norm(middle - start), np.linalg.norm(end - start), np.linalg.norm(end - middle))
+    height_m = np.linalg.norm(np.cross(middle - start, end - start)) / max(longest, 1e-9)
+    if height_m < _MIN_ARC_M:
+        raise CommandRejectedError(
+            f"Z1: the start and the two poses of an arc are within {1e3 * height_m:.1f} mm of one line (allowed from "
+            f"{1e3 * _MIN_ARC_M:.0f} mm): the controller would never end it. Use MOVEL, or another middle pose.",
+            code="arc_on_line",
+        )

@@ -121,9 +121,10 @@ def test_a_label_has_the_measured_layout() -> None:
     assert controller.decode_command(data).label() == "startFlat"
     full = controller.encode_command(Fsm.TOSTATE, "0123456789")
     assert controller.decode_command(full).label() == "0123456789"
+    assert controller.decode_command(controller.encode_command(Fsm.TOSTATE, "my label")).label() == "my label"
 
 
-@pytest.mark.parametrize("label", ["", "01234567890", "grün", "two words", "a\nb"])
+@pytest.mark.parametrize("label", ["", "01234567890", "grün", "a\nb"])
 def test_a_label_that_cannot_be_sent_is_rejected(label: str) -> None:
     with raises(ProtocolError, "label"):
         controller.encode_command(Fsm.TOSTATE, label)
@@ -135,11 +136,16 @@ def test_a_body_without_a_label_is_rejected(body: bytes) -> None:
         Command(state=Fsm.TOSTATE, track=False, body=body).label()
 
 
-@pytest.mark.parametrize("size", [0, 1, 6, 146, 148, 208, 1500, 65_000])
-def test_a_command_of_a_wrong_size_is_rejected(size: int) -> None:
+@pytest.mark.parametrize("size", [0, 1, 6, 146])
+def test_a_command_that_is_too_short_is_rejected(size: int) -> None:
     with raises(ProtocolError, "wrong_size") as caught:
-        controller.decode_command((GOLDEN_COMMAND * 500)[:size])
+        controller.decode_command(GOLDEN_COMMAND[:size])
     assert f"{size} bytes; allowed are 147" in str(caught.value)
+
+
+@pytest.mark.parametrize("size", [148, 208, 1500, 65_000])
+def test_a_longer_command_is_cut_as_the_vendors_controller_cuts_it(size: int) -> None:
+    assert controller.decode_command((GOLDEN_COMMAND * 500)[:size]) == controller.decode_command(GOLDEN_COMMAND)
 
 
 @pytest.mark.parametrize("size", [0, 1, 5, 147, 207, 209, 65_000])
@@ -148,18 +154,15 @@ def test_a_state_of_a_wrong_size_is_rejected(size: int) -> None:
         controller.decode_state((GOLDEN_STATE * 400)[:size])
 
 
-@pytest.mark.parametrize(
-    ("at", "value", "code"),
-    [
-        (0, b"\x00", "wrong_head"),
-        (2, b"\x11", "unknown_state"),
-        (2, b"\xff\xff\xff\xff", "unknown_state"),
-        (6, b"\x02", "track_flag"),
-    ],
-)
-def test_a_command_with_a_corrupt_head_is_rejected(at: int, value: bytes, code: str) -> None:
-    with raises(ProtocolError, code):
-        controller.decode_command(patch(GOLDEN_COMMAND, at, value))
+def test_a_command_with_another_head_is_rejected() -> None:
+    with raises(ProtocolError, "wrong_head"):
+        controller.decode_command(patch(GOLDEN_COMMAND, 0, b"\x00"))
+
+
+def test_an_unknown_state_requests_none_and_every_flag_tracks() -> None:
+    for state in (b"\x11", b"\xff\xff\xff\xff"):
+        assert controller.decode_command(patch(GOLDEN_COMMAND, 2, state)).state is Fsm.INVALID
+    assert controller.decode_command(patch(GOLDEN_COMMAND, 6, b"\x02")).track
 
 
 @pytest.mark.parametrize(

@@ -24,8 +24,17 @@ from hal.z1_protocol.states import MOVES, Fsm, is_granted
         (Fsm.JOINTCTRL, Fsm.TOSTATE, True),
         (Fsm.CARTESIAN, Fsm.BACKTOSTART, True),
         (Fsm.MOVEJ, Fsm.JOINTCTRL, True),
-        (Fsm.MOVEJ, Fsm.MOVEL, False),
+        (Fsm.MOVEJ, Fsm.MOVEL, True),
+        (Fsm.MOVEJ, Fsm.TOSTATE, False),
         (Fsm.TEACH, Fsm.JOINTCTRL, True),
+        (Fsm.TEACH, Fsm.BACKTOSTART, True),
+        (Fsm.TOSTATE, Fsm.BACKTOSTART, True),
+        (Fsm.LOWCMD, Fsm.BACKTOSTART, True),
+        (Fsm.CARTESIAN, Fsm.TEACH, False),
+        (Fsm.CARTESIAN, Fsm.TEACHREPEAT, False),
+        (Fsm.CARTESIAN, Fsm.TRAJECTORY, False),
+        (Fsm.TEACHREPEAT, Fsm.PASSIVE, False),
+        (Fsm.TRAJECTORY, Fsm.NEXT, True),
     ],
 )
 def test_a_request_is_granted_as_the_controller_grants_it(present: Fsm, requested: Fsm, expected: bool) -> None:
@@ -38,7 +47,7 @@ def test_staying_is_always_granted(state: Fsm) -> None:
     assert is_granted(state, Fsm.INVALID)
 
 
-@pytest.mark.parametrize("state", sorted(MOVES))
-def test_no_move_starts_from_lowcmd_or_during_another(state: Fsm) -> None:
+@pytest.mark.parametrize("state", sorted(MOVES - {Fsm.BACKTOSTART}))
+def test_from_lowcmd_the_arm_moves_to_its_start_alone(state: Fsm) -> None:
     assert not is_granted(Fsm.LOWCMD, state)
-    assert not is_granted(Fsm.TRAJECTORY if state is not Fsm.TRAJECTORY else Fsm.MOVEL, state)
+    assert is_granted(Fsm.LOWCMD, Fsm.BACKTOSTART)

@@ -50,7 +50,7 @@ def test_a_client_is_answered_until_the_signal(spelling: str) -> None:
             assert process.wait(20.0) == 0
         finally:
             process.kill()
-    assert summary.startswith("1 answers; 1 invalid datagrams (the last one: a command has 8 bytes")
+    assert "answers; 1 invalid datagrams (the last one: a command has 8 bytes" in summary
 
 
 def test_the_folded_arm_rests_on_itself_in_passive() -> None:

@@ -30,6 +30,7 @@ from sim_twin.controller.controlled_world import ControlledWorld
 from sim_twin.drop_in.realsense_source import TwinSource
 from sim_twin.model.scene import SceneConfig
 from sim_twin.model.world import World
+from tests.support.hal.twin_link import TwinLink
 from tests.support.hal.z1_peer import FakeController, MemoryLink
 
 TWIN_Z1 = "z1 over the twin"
@@ -124,8 +125,7 @@ def z1_over_the_twin() -> tuple[Arm, Clock]:
     """Return the real arm's driver connected to the twin's controller, in lock-step, and the clock."""
     world = World(SceneConfig())
     twin, clock = ControlledWorld(world), TwinClock(world)
-    clock.call_every_tick(twin.tick)
-    return ARMS.make("z1", clock=clock, link=MemoryLink(twin, clock, latency_s=0.0)), clock
+    return ARMS.make("z1", clock=clock, link=TwinLink(twin, clock)), clock
 
 
 @contextmanager

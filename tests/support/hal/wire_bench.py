@@ -19,7 +19,7 @@ from sim_twin.controller.controlled_world import ControlledWorld
 from sim_twin.model.scene import SceneConfig
 from sim_twin.model.world import World
 from tests.support.faults_table import FaultsTable, describe
-from tests.support.hal.z1_peer import MemoryLink
+from tests.support.hal.twin_link import TwinLink
 
 PERIOD_S = z1.CONTROL_PERIOD_S
 MOVE_S = 1.2
@@ -61,10 +61,9 @@ class WireBench:
         self.world = World(SceneConfig())
         self.twin = ControlledWorld(self.world)
         self.twin_clock = TwinClock(self.world)
-        self.twin_clock.call_every_tick(self.twin.tick)
-        self.twin_clock.call_every_tick(self._record_torque)
         self.clock = JumpingClock(self.twin_clock)
-        self.link = MemoryLink(self.twin, self.clock, name="the twin")
+        self.link = TwinLink(self.twin, self.twin_clock, self.clock)
+        self.twin_clock.call_every_tick(self._record_torque)
         self.arm = Z1Arm(self.clock, Z1ArmConfig(mode=mode), link=self.link)
         self.servo = Servo(self.arm, self.clock, heartbeat_timeout_s=_HEARTBEAT_TIMEOUT_S)
         self.highest_torque = np.zeros(z1.N_JOINTS)

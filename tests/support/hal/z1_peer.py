@@ -241,6 +241,9 @@ class MemoryLink:
     def describe(self) -> str:
         return self.name
 
+    def fileno(self) -> int | None:
+        return None
+
 
 @contextmanager
 def serving(peer: FakeController) -> Iterator[tuple[int, int]]:

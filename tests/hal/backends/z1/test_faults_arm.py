@@ -44,7 +44,8 @@ def test_a_motor_board_that_falls_silent(mode: Z1Mode, faults_table: FaultsTable
     bench.play(lambda: setattr(bench.twin.motors, "silent", True))
     bench.assert_safe()
     assert bench.status.mode is ServoMode.STOPPED
-    assert "repeated one measurement" in bench.status.reason
+    # Both are true of it; the one that is found first depends on the delay of the commands
+    assert any(text in bench.status.reason for text in ("repeated one measurement", "does not follow"))
     bench.report(faults_table, f"motor board silent ({mode})")
 
 

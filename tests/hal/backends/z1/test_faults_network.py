@@ -22,14 +22,14 @@ def test_a_tenth_of_all_datagrams(fate: str, faults_table: FaultsTable) -> None:
     bench = WireBench()
     network = BadNetwork(FATES[fate])
     bench.play(lambda: setattr(bench.link, "mangle", network))
-    assert network.touched > 100
+    assert network.touched > 50
     bench.assert_safe()
     assert bench.status.finished or bench.status.mode is ServoMode.STOPPED
     bench.report(faults_table, f"10 % of all datagrams {fate}")
 
 
 def test_random_datagrams(faults_table: FaultsTable) -> None:
-    """Of any size, of the right size, and with the right head as well; half of them to the arm, half to the driver."""
+    """Half of them to the driver, with the right head as well; half to the controller, which would obey that head."""
     bench = WireBench(Z1Mode.LOW_LEVEL)
     rng = np.random.default_rng(0)
     per_tick = 100
@@ -44,11 +44,12 @@ def test_random_datagrams(faults_table: FaultsTable) -> None:
         if sent >= FUZZ:
             return [data]
         sent += per_tick
-        size, head = (STATE_SIZE, b"\xfe\xff\x02\0\0\0") if len(data) == STATE_SIZE else (COMMAND_SIZE, b"\xfe\xff")
+        size, head = (STATE_SIZE, b"\xfe\xff\x02\0\0\0") if len(data) == STATE_SIZE else (COMMAND_SIZE, b"")
         return [noise(size, head) for _ in range(per_tick)] + [data]
 
     bench.play(lambda: setattr(bench.link, "mangle", flood))
     assert sent >= FUZZ
-    assert bench.twin.invalid_datagrams + bench.arm.diagnostics().counts.invalid > 0.9 * FUZZ
+    port, counts = bench.twin.port, bench.arm.diagnostics().counts
+    assert port.dropped + port.invalid_datagrams + counts.invalid > 0.9 * FUZZ
     bench.assert_safe()
     bench.report(faults_table, f"{sent:,} random datagrams")

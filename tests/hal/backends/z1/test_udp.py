@@ -11,6 +11,7 @@ import pytest
 
 from hal.backends.z1.arm import Z1Arm
 from hal.backends.z1.config import Z1ArmConfig, Z1Mode
+from hal.backends.z1.requests import RequestPhase
 from hal.base import z1
 from hal.base.clock import WallClock
 from hal.base.errors import CommandRejectedError, HalTimeoutError, LeaseError
@@ -25,6 +26,8 @@ from tests.support.faults_table import FaultsTable
 from tests.support.hal.z1_peer import FakeController, serving
 
 pytestmark = pytest.mark.integration
+
+BEGUN = (Fsm.TOSTATE, RequestPhase.DONE)
 
 
 def resting_peer(shift: float = 0.0) -> FakeController:
@@ -125,7 +128,7 @@ def test_a_stop_from_another_thread_ends_a_wait(peer: FakeController, config: Z1
 
     thread = Thread(target=run, daemon=True)
     thread.start()
-    await_true(lambda: peer.fsm is Fsm.TOSTATE)
+    await_true(lambda: (last := arm._requests.last) is not None and (last.state, last.phase) == BEGUN)
     arm.stop()
     assert ended.wait(5.0)
     assert peer.fsm is Fsm.JOINTCTRL

@@ -96,7 +96,7 @@ def test_impossible_requests_return_false_and_are_logged(
     arm: ArmInterface, peer: FakeController, caplog: pytest.LogCaptureFixture
 ) -> None:
     assert not arm.labelRun("nowhere")
-    assert "the controller stays in JOINTCTRL" in caplog.text
+    assert "read the request for TOSTATE and refuses it" in caplog.text
     assert not arm.MoveJ(np.array([0, 0, 0, 2.0, 0, 0]), 1.0)
     assert "is unreachable within the joint limits" in caplog.text
     assert not arm.setFsm(ArmFSMState.LOWCMD)
