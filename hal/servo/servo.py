@@ -204,6 +204,7 @@ class Servo:
             self.limits,
             setpoint.q,
             setpoint.dq,
+            q_command=snapshot.q_desired,
             q_last=snapshot.q_sent,
             q_measured=snapshot.state.q,
             dq_measured=snapshot.state.dq,
