@@ -563,14 +563,33 @@ def test_a_latched_stop_and_its_end_are_logged_once_each(caplog: pytest.LogCaptu
     assert second == "servo: re-armed"
 
 
-def test_clipping_is_logged_once_a_second(caplog: pytest.LogCaptureFixture) -> None:
+def test_clipping_is_logged_once_an_episode_with_its_meaning(caplog: pytest.LogCaptureFixture) -> None:
     bench = Bench()
     beyond = START.copy()
     beyond[4] = Q_MAX[4] + 0.5
     with caplog.at_level(logging.WARNING, logger="hal"):
-        bench.run(2.5, lambda: bench.servo.send(setpoint(beyond)) and None)
-    assert 2 <= len(caplog.records) <= 3
-    assert "clipped" in caplog.text
+        for _ in range(2):
+            bench.run(2.5, lambda: bench.servo.send(setpoint(beyond)) and None)
+            bench.run(1.5)
+    assert len(caplog.records) == 2
+    assert "beyond its joint limits" in caplog.text
+
+
+@pytest.mark.parametrize("offset", [-0.0003, 0.0])
+def test_an_arm_at_rest_on_a_joint_limit_is_not_clipped(offset: float, caplog: pytest.LogCaptureFixture) -> None:
+    folded = np.zeros(N_JOINTS)
+    folded[1] = Q_MIN[1] + offset
+    bench = Bench(start=folded)
+    with caplog.at_level(logging.WARNING, logger="hal"):
+        bench.run(2.0)
+    assert caplog.records == []
+    assert bench.servo._cycle.clipped_count == 0
+    lifted = np.zeros(N_JOINTS)
+    lifted[1] = 0.2
+    bench.servo.stream(move(start=np.zeros(N_JOINTS), step=lifted))
+    bench.run(1.3)
+    assert bench.servo.status().finished
+    assert bench.servo._cycle.clipped_count == 0
 
 
 def test_a_ticked_arm_is_read_by_the_tick_alone() -> None:
