@@ -49,7 +49,9 @@ def frozen_array(value: Any, dtype: Any, shape: tuple[int | None, ...], name: st
     if array.dtype.kind == "f":
         flat = array.ravel()
         # The sum of squares bounds them all, and is NaN or infinite with one of them: much faster than `isfinite`.
-        if not flat.dot(flat) <= MAX_MAGNITUDE:
+        with np.errstate(over="ignore", invalid="ignore"):
+            bounded = flat.dot(flat) <= MAX_MAGNITUDE
+        if not bounded:
             _check_magnitudes(flat, name)
     array.setflags(write=False)
     return array
