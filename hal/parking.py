@@ -14,6 +14,7 @@ from hal.base.errors import CommandRejectedError, GuardError, HalError, StoppedE
 from hal.base.messages import ServoMode, TrajectoryChunk, frozen_array
 from hal.servo.limits import ServoLimits
 from hal.servo.servo import Servo
+from hal.servo.trajectory_buffer import MAX_BUFFER_S
 
 _LOG = logging.getLogger(__name__)
 _OWNER = "HAL parking"
@@ -32,7 +33,7 @@ class Parking:
     q: np.ndarray
     """(6,) folded pose [rad], in which the arm rests without its motors."""
     speed_rad_s: float = 0.3
-    """Maximum joint speed [rad/s]."""
+    """Maximum joint speed [rad/s]; more where the motion would take longer than `MAX_BUFFER_S`."""
     disable_motors: Callable[[], None] | None = None
     """Disables the motors, after the last tick of a parked arm; None = they hold."""
 
@@ -115,7 +116,8 @@ def _plan_quintic(
         np.sqrt(5.78 * distance / limits.ddq_max),
         np.cbrt(60.0 * distance / limits.dddq_max),
     )
-    duration_s = max(float(np.max(times_s)), _MIN_DURATION_S)
+    # One chunk, so that nothing moves where a part of the path is not allowed; a slower one would not be accepted.
+    duration_s = min(max(float(np.max(times_s)), _MIN_DURATION_S), MAX_BUFFER_S)
     u = np.linspace(0.0, 1.0, round(duration_s / _SPACING_S) + 1)
     return TrajectoryChunk(
         trajectory_id=trajectory_id,

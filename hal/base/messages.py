@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 from enum import Enum
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -16,38 +17,88 @@ from hal.base.errors import InvalidMessageError
 from hal.base.z1 import N_JOINTS
 
 
+MAX_MAGNITUDE = 1e6
+"""Maximum magnitude of every number of an array; joint speeds, torques and distances are below 1e3 in SI units."""
+MAX_STAMP_S = 1e11
+"""Maximum magnitude of a time [s], three thousand years."""
+MAX_COUNT = 2**53
+"""Maximum magnitude of an integer; up to it, floats hold all of them."""
+MAX_TEXT = 4000
+"""Maximum length of a text."""
+MAX_CHUNK_POINTS = 100_000
+"""Maximum number of points of a trajectory chunk; the servo accepts a tenth of it."""
+MIN_SPACING_S = 1e-6
+"""Minimum time between two points of a trajectory [s]; less would make quotients of differences meaningless."""
+
+
 def frozen_array(value: Any, dtype: Any, shape: tuple[int | None, ...], name: str) -> np.ndarray:
     """Return a read-only copy of `value` as an array of `dtype`, checked against `shape` (None = any length).
 
     Raises:
-        InvalidMessageError: wrong shape (`wrong_shape`), or a float that is not finite (`not_finite`).
+        InvalidMessageError: wrong shape (`wrong_shape`), or a float that is not finite (`not_finite`) or larger than
+            `MAX_MAGNITUDE` (`out_of_range`).
     """
     array = np.array(value, dtype=dtype)  # a copy: the caller's own array stays writable
-    wrong = array.ndim != len(shape) or any(
-        want is not None and want != have for want, have in zip(shape, array.shape, strict=True)
-    )
-    if wrong:
+    if array.shape != shape and (
+        array.ndim != len(shape)
+        or any(want is not None and want != have for want, have in zip(shape, array.shape, strict=True))
+    ):
         raise InvalidMessageError(
             f"{name} has shape {array.shape} (allowed {shape}, None = any length).", code="wrong_shape"
         )
-    if array.dtype.kind == "f" and array.size and not np.isfinite(array).all():
-        raise InvalidMessageError(
-            f"{name} has values that are not finite ({array[~np.isfinite(array)][:3]}).", code="not_finite"
-        )
+    if array.dtype.kind == "f":
+        flat = array.ravel()
+        # The sum of squares bounds them all, and is NaN or infinite with one of them: much faster than `isfinite`.
+        with np.errstate(over="ignore", invalid="ignore"):
+            bounded = flat.dot(flat) <= MAX_MAGNITUDE
+        if not bounded:
+            _check_magnitudes(flat, name)
     array.setflags(write=False)
     return array
 
 
+def _check_magnitudes(flat: np.ndarray, name: str) -> None:
+    if not np.isfinite(flat).all():
+        raise InvalidMessageError(
+            f"{name} has values that are not finite ({flat[~np.isfinite(flat)][:3]}).", code="not_finite"
+        )
+    if np.abs(flat).max() > MAX_MAGNITUDE:
+        raise InvalidMessageError(
+            f"{name} has a value of {np.abs(flat).max():.4g} (allowed up to {MAX_MAGNITUDE:g}).", code="out_of_range"
+        )
+
+
 def _freeze(message: Any, **arrays: tuple[Any, tuple[int | None, ...]]) -> None:
+    """Replace the message's `arrays` by read-only copies of the dtype and shape, and check all its other fields."""
+    kind = type(message)
     for name, (dtype, shape) in arrays.items():
-        value = getattr(message, name)
-        object.__setattr__(message, name, frozen_array(value, dtype, shape, f"{type(message).__name__}.{name}"))
-    for field in fields(message):
-        value = getattr(message, field.name)
-        if isinstance(value, float) and not np.isfinite(value):
-            raise InvalidMessageError(
-                f"{type(message).__name__}.{field.name} is {value} (allowed finite values).", code="not_finite"
-            )
+        object.__setattr__(
+            message, name, frozen_array(getattr(message, name), dtype, shape, f"{kind.__name__}.{name}")
+        )
+    for name in _plain_fields(kind):
+        _check_plain(getattr(message, name), f"{kind.__name__}.{name}")
+
+
+@cache
+def _plain_fields(kind: type) -> tuple[str, ...]:
+    """Return the names of the fields whose types are not arrays, as written in the class."""
+    return tuple(field.name for field in fields(kind) if "ndarray" not in str(field.type))
+
+
+def _check_plain(value: Any, label: str) -> None:
+    """Reject a number or a text out of its range."""
+    if isinstance(value, float):
+        if not np.isfinite(value):
+            raise InvalidMessageError(f"{label} is {value} (allowed finite values).", code="not_finite")
+        if abs(value) > MAX_STAMP_S:
+            raise InvalidMessageError(f"{label} is {value:.4g} (allowed up to {MAX_STAMP_S:g}).", code="out_of_range")
+    elif isinstance(value, int) and abs(value) > MAX_COUNT:
+        raise InvalidMessageError(f"{label} is an integer of more than 53 bits.", code="out_of_range")
+    elif isinstance(value, str) and len(value) > MAX_TEXT:
+        raise InvalidMessageError(f"{label} has {len(value)} letters (allowed {MAX_TEXT}).", code="out_of_range")
+    elif isinstance(value, tuple):
+        for item in value:
+            _check_plain(item, label)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -66,6 +117,9 @@ class Intrinsics:
     """Principal point, column [px]; the centre of pixel (0, 0) is at 0.0."""
     cy: float
     """Principal point, row [px]."""
+
+    def __post_init__(self) -> None:
+        _freeze(self)
 
     @property
     def K(self) -> np.ndarray:
@@ -175,10 +229,20 @@ class TrajectoryChunk:
 
     def __post_init__(self) -> None:
         n = len(np.atleast_1d(self.t_s))
-        _freeze(self, t_s=(float, (n,)), q=(float, (n, N_JOINTS)), dq=(float, (n, N_JOINTS)))
-        if n == 0 or (np.diff(self.t_s) <= 0).any():
+        if not 0 < n <= MAX_CHUNK_POINTS:
             raise InvalidMessageError(
-                f"TrajectoryChunk.t_s has {n} times (allowed one or more, strictly increasing).", code="invalid_times"
+                f"TrajectoryChunk.t_s has {n} times (allowed 1 to {MAX_CHUNK_POINTS}).", code="invalid_times"
+            )
+        _freeze(self, t_s=(float, (n,)), q=(float, (n, N_JOINTS)), dq=(float, (n, N_JOINTS)))
+        if (np.diff(self.t_s) < MIN_SPACING_S).any() or self.t_s[0] < -MIN_SPACING_S:
+            raise InvalidMessageError(
+                f"TrajectoryChunk.t_s goes from {self.t_s[0]:.6g} to {self.t_s[-1]:.6g} s (allowed from 0, increasing "
+                f"by at least {MIN_SPACING_S:g} s).",
+                code="invalid_times",
+            )
+        if self.trajectory_id < 1:
+            raise InvalidMessageError(
+                f"TrajectoryChunk.trajectory_id is {self.trajectory_id} (allowed from 1).", code="out_of_range"
             )
 
 
@@ -260,3 +324,6 @@ class ServoHealth:
     """Age of the owner's last command or heartbeat [s]; 0 while the lease is free."""
     real_time: tuple[str, ...]
     """Real-time resources granted to the servo's thread, such as SCHED_FIFO; empty = ordinary scheduling."""
+
+    def __post_init__(self) -> None:
+        _freeze(self)

@@ -1,107 +1,89 @@
-"""Braking to rest, tracking of a single target, and blends between motions, all without a jump in the command.
+"""Stops of every joint by itself, tracking of a single target, and motions between two postures at rest.
 
-A stop prefers the path that is being played (`PathStop`: same path, time slowed down). Where too little of it is
-buffered, or the command is off the path, every joint brakes by itself (`Brake`, jerk-limited by Ruckig).
+They are off any planned path: the servo commands a step of them only while the stop from it, computed here, ends
+inside the joint limits and the guard's space (`hal.servo.setpoint_generator`).
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
-from ruckig import ControlInterface, InputParameter, Ruckig, Synchronization, Trajectory
+from ruckig import InputParameter, Ruckig, Synchronization, Trajectory
 
 from hal.base.z1 import CONTROL_PERIOD_S, N_JOINTS
 from hal.servo.limits import ServoLimits
-from hal.servo.trajectory_buffer import TrajectoryBuffer
 
-_STEP_FACTOR = 1.25
-_MAX_ATTEMPTS = 10  # 1.25⁹ = 7.5 times the limits at the last one
-_MIN_STOP_S = 10 * CONTROL_PERIOD_S  # a stop from almost no speed still gets a few ticks to slow down in
+_SAMPLE_S = 0.005
+"""Time between two postures of a stop that are checked [s]: at full speed a joint turns 0.016 rad in it."""
 
 
-class Brake:
-    """A planner of jerk-limited stops by Ruckig's velocity interface."""
+class MotionState(NamedTuple):
+    """A point of a motion."""
 
-    def __init__(self, limits: ServoLimits) -> None:
-        self._limits = limits
-        self._ruckig = Ruckig(N_JOINTS)
-        self._input = InputParameter(N_JOINTS)
-        self._input.control_interface = ControlInterface.Velocity
-        # Every joint stops as soon as it can; none is stretched to the slowest one's time.
-        self._input.synchronization = Synchronization.No
-        self._input.target_velocity = [0.0] * N_JOINTS
-        self._input.target_acceleration = [0.0] * N_JOINTS
-
-    def plan(self, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> JointStop:
-        """Return the stop from `q`, `dq`, `ddq` (7,) [rad, rad/s, rad/s²].
-
-        Acceleration and jerk are the limits' for every joint that comes to rest in time and inside its position
-        limits with them (Ruckig ignores `max_position`, so the extrema are checked here); a joint that does not
-        brakes harder, in steps of 25 %, up to 7.5 times as hard.
-        """
-        limits, inp = self._limits, self._input
-        inp.current_position = q.tolist()
-        inp.current_velocity = dq.tolist()
-        inp.current_acceleration = np.clip(ddq, -limits.ddq_max, limits.ddq_max).tolist()
-        # An arm that starts outside its limits may stay outside, but not go further.
-        low, high = np.minimum(limits.q_min, q) - 1e-9, np.maximum(limits.q_max, q) + 1e-9
-        factor = np.ones(N_JOINTS)
-        path = Trajectory(N_JOINTS)
-        for _ in range(_MAX_ATTEMPTS):
-            inp.max_acceleration = (factor * limits.ddq_max).tolist()
-            inp.max_jerk = (factor * limits.dddq_max).tolist()
-            self._ruckig.calculate(inp, path)
-            extrema = path.position_extrema
-            # Each joint's own; `path.duration` is the slowest one's.
-            late = np.array(path.independent_min_durations) > limits.brake_s
-            outside = np.array([e.min for e in extrema]) < low
-            outside |= np.array([e.max for e in extrema]) > high
-            if not (late | outside).any():
-                break
-            factor[late | outside] *= _STEP_FACTOR
-        return JointStop(path)
+    q: np.ndarray
+    """(7,) positions [rad]."""
+    dq: np.ndarray
+    """(7,) velocities [rad/s]."""
+    ddq: np.ndarray
+    """(7,) accelerations [rad/s²]."""
 
 
 class JointStop:
-    """A stop of every joint by itself, which leaves the path."""
+    """The fastest stop of every joint by itself within limits of acceleration and jerk.
 
-    def __init__(self, path: Trajectory) -> None:
-        self._path = path
-        self.duration_s: float = path.duration
+    Each joint has three phases: jerk towards the deceleration, constant deceleration, and jerk back to 0.
+
+    Args:
+        state: present command.
+        ddq_max: (7,) maximum accelerations [rad/s²]; more where `state` has more.
+        dddq_max: (7,) maximum jerks [rad/s³].
+    """
+
+    def __init__(self, state: MotionState, ddq_max: np.ndarray, dddq_max: np.ndarray) -> None:
+        # The direction in which a joint would move once its acceleration had been brought to 0.
+        sign = np.where(state.dq + state.ddq * np.abs(state.ddq) / (2 * dddq_max) < 0.0, -1.0, 1.0)
+        v, a, jerk = sign * state.dq, sign * state.ddq, dddq_max
+        limit = np.maximum(ddq_max, np.abs(a))
+        # The speed that is left for the deceleration's way down to its peak and back.
+        peak_squared = np.maximum(jerk * v + 0.5 * a * a, 0.0)
+        peak = np.minimum(np.sqrt(peak_squared), limit)
+        held_s = (peak_squared - peak * peak) / np.maximum(jerk * peak, 1e-12)
+        self._ends = np.cumsum([np.maximum(a + peak, 0.0) / jerk, held_s, peak / jerk], axis=0)  # (3, 7)
+        # Position, velocity and acceleration at the beginning of each phase, and its jerk, all (7,).
+        self._begin: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = []
+        q, dq, ddq, begin = state.q, state.dq, state.ddq, np.zeros(N_JOINTS)
+        for end, j in zip(self._ends, (-sign * jerk, np.zeros(N_JOINTS), sign * jerk), strict=True):
+            self._begin.append((q, dq, ddq, j))
+            t, begin = end - begin, end
+            q, dq, ddq = q + t * (dq + t * (ddq / 2 + t * j / 6)), dq + t * (ddq + t * j / 2), ddq + t * j
+        self.q_rest = q
+        """(7,) position at rest [rad]."""
+        self.duration_s = float(self._ends[-1].max())
         """Duration until the last joint is at rest [s]."""
 
     def at(self, t_s: float) -> tuple[np.ndarray, np.ndarray]:
         """Return position and velocity (7,) `t_s` [s] after the stop began."""
-        q, dq, _ = self._path.at_time(min(t_s, self.duration_s))
-        return np.array(q), np.array(dq)
+        if t_s >= self.duration_s:
+            return self.q_rest, np.zeros(N_JOINTS)
+        q, dq = self._sample(np.array([[t_s]]))
+        return q[0], dq[0]
 
+    def positions(self) -> np.ndarray:
+        """Return positions (N, 7) [rad] close to each other from the beginning to rest."""
+        times = np.arange(0.0, self.duration_s, _SAMPLE_S)[:, None]
+        return np.vstack([self._sample(times)[0], self.q_rest]) if len(times) else self.q_rest[None]
 
-class PathStop:
-    """A stop along the trajectory being played: its time slows down to zero, and the arm stays on the planned path."""
-
-    def __init__(self, path: TrajectoryBuffer, start_s: float, duration_s: float) -> None:
-        self._path, self._start_s = path, start_s
-        self.duration_s = duration_s
-        """Duration until rest [s]; the trajectory's own time advances by half of that."""
-
-    def at(self, t_s: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return position and velocity (7,) `t_s` [s] after the stop began."""
-        # The time's rate is 1 − 3u² + 2u³: it starts at 1 and ends at 0, each with zero slope.
-        u = min(t_s / self.duration_s, 1.0)
-        q, dq = self._path.at(self._start_s + self.duration_s * (u - u**3 + 0.5 * u**4))
-        return q, (1.0 - 3.0 * u**2 + 2.0 * u**3) * dq
-
-
-def plan_path_stop(path: TrajectoryBuffer, start_s: float, limits: ServoLimits) -> PathStop | None:
-    """Return the stop along `path` from its time `start_s` [s]; None where too little of it is buffered to stop on.
-
-    It lasts as long as the limits of acceleration and jerk need for the speed there, at most `brake_s`.
-    """
-    # A stop of `brake_s` covers half of that in the path's own time, so the last sample is there.
-    speed = np.abs([path.at(start_s + ratio * limits.brake_s)[1] for ratio in (0.0, 0.25, 0.5)]).max(axis=0)
-    # Maxima of the slow-down 1 − 3u² + 2u³ over the duration T: acceleration 3/2 v/T, jerk 6 v/T².
-    needed_s = np.max([1.5 * speed / limits.ddq_max, np.sqrt(6.0 * speed / limits.dddq_max)])
-    duration_s = min(max(float(needed_s), _MIN_STOP_S), limits.brake_s)
-    return PathStop(path, start_s, duration_s) if start_s + 0.5 * duration_s <= path.end_s else None
+    def _sample(self, t_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return positions and velocities (N, 7) at `t_s` (N, 1) [s]."""
+        first, second, last = self._ends
+        phase = (t_s >= first).astype(np.intp) + (t_s >= second)
+        joints = np.arange(N_JOINTS)
+        q, dq, ddq, j = (np.array(values)[phase, joints] for values in zip(*self._begin, strict=True))
+        t = np.minimum(t_s, last) - np.array([np.zeros(N_JOINTS), first, second])[phase, joints]
+        moving = t_s < last
+        q = q + t * (dq + t * (ddq / 2 + t * j / 6))
+        return np.where(moving, q, self.q_rest), np.where(moving, dq + t * (ddq + t * j / 2), 0.0)
 
 
 class TargetTracker:
@@ -110,53 +92,46 @@ class TargetTracker:
     def __init__(self, limits: ServoLimits) -> None:
         self._limits = limits
         self._ruckig = Ruckig(N_JOINTS)
-        self._input = InputParameter(N_JOINTS)
-        self._input.synchronization = Synchronization.No
-        self._input.max_velocity = limits.dq_max.tolist()
-        self._input.max_acceleration = limits.ddq_max.tolist()
-        self._input.max_jerk = limits.dddq_max.tolist()
+        self._input = _make_input(limits)
         self._path = Trajectory(N_JOINTS)
 
-    def step(
-        self, q_target: np.ndarray, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return position, velocity and acceleration (7,) one control period after `q`, `dq`, `ddq` (7,).
+    def step(self, q_target: np.ndarray, state: MotionState) -> MotionState:
+        """Return the state one control period after `state`, on the fastest motion to rest at the target.
 
-        They are on the fastest motion to rest at the target; a target beyond the joint limits is clipped to them.
+        A target beyond the joint limits is clipped to them.
         """
         limits, inp = self._limits, self._input
-        inp.current_position = q.tolist()
-        inp.current_velocity = np.clip(dq, -limits.dq_max, limits.dq_max).tolist()
-        inp.current_acceleration = np.clip(ddq, -limits.ddq_max, limits.ddq_max).tolist()
+        inp.current_position = state.q.tolist()
+        inp.current_velocity = np.clip(state.dq, -limits.dq_max, limits.dq_max).tolist()
+        inp.current_acceleration = np.clip(state.ddq, -limits.ddq_max, limits.ddq_max).tolist()
         inp.target_position = np.clip(q_target, limits.q_min, limits.q_max).tolist()
         self._ruckig.calculate(inp, self._path)
-        q_next, dq_next, ddq_next = self._path.at_time(CONTROL_PERIOD_S)
-        return np.array(q_next), np.array(dq_next), np.array(ddq_next)
+        return MotionState(*map(np.array, self._path.at_time(CONTROL_PERIOD_S)))
 
 
-class Blend:
-    """An offset in position and velocity that decays to zero as a cubic within the acceleration limits.
+class JointMove:
+    """The fastest motion from rest to rest, each joint by itself."""
 
-    Added to a motion, it makes that motion start from the present command.
+    def __init__(self, q_start: np.ndarray, q_goal: np.ndarray, limits: ServoLimits) -> None:
+        inp = _make_input(limits)
+        inp.current_position, inp.target_position = q_start.tolist(), q_goal.tolist()
+        self._path = Trajectory(N_JOINTS)
+        Ruckig(N_JOINTS).calculate(inp, self._path)
+        self._q_goal = q_goal
+        self.duration_s: float = self._path.duration
+        """Duration [s]."""
 
-    Args:
-        q: (7,) initial position offset [rad].
-        dq: (7,) initial velocity offset [rad/s].
-        ddq_max: (7,) maximum accelerations [rad/s²].
-    """
+    def at(self, t_s: float) -> MotionState:
+        """Return the state `t_s` [s] after the start."""
+        if t_s >= self.duration_s:
+            return MotionState(self._q_goal, np.zeros(N_JOINTS), np.zeros(N_JOINTS))
+        return MotionState(*map(np.array, self._path.at_time(t_s)))
 
-    def __init__(self, q: np.ndarray, dq: np.ndarray, ddq_max: np.ndarray) -> None:
-        # The cubic from (q, dq) to rest in T has its maximum acceleration at an end: at most 6|q|/T² + 4|dq|/T.
-        v, a = np.abs(dq), ddq_max
-        self.duration_s = float(((4 * v + np.sqrt(16 * v * v + 24 * a * np.abs(q))) / (2 * a)).max())
-        self._q, self._dq = q, dq
 
-    def at(self, t_s: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return the offset left (7,) [rad] and its rate (7,) [rad/s] at `t_s` [s]."""
-        T = self.duration_s
-        if t_s >= T:
-            return np.zeros_like(self._q), np.zeros_like(self._q)
-        s = t_s / T
-        q = (1 - s) ** 2 * ((1 + 2 * s) * self._q + s * T * self._dq)
-        dq = 6 * s * (s - 1) / T * self._q + (3 * s * s - 4 * s + 1) * self._dq
-        return q, dq
+def _make_input(limits: ServoLimits) -> InputParameter:
+    inp = InputParameter(N_JOINTS)
+    inp.synchronization = Synchronization.No
+    inp.max_velocity = limits.dq_max.tolist()
+    inp.max_acceleration = limits.ddq_max.tolist()
+    inp.max_jerk = limits.dddq_max.tolist()
+    return inp

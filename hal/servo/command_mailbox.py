@@ -1,13 +1,14 @@
 """Command mailbox between the producers' threads and the tick: lease, trajectory queue, single setpoint, latched stop.
 
-Any thread calls the methods, which take `_lock` to keep the producers apart. The tick takes no lock: it reads and
-replaces whole attributes that hold immutable objects (`trajectory`, `target`, `latch`), which Python does atomically,
-and each counter has one writer (`cancelled_id` the producers, `played_id` the tick). A stop therefore takes effect at
-the next tick whatever else is running.
+Any thread calls the methods, which take `_lock` to keep the producers apart. The tick and `stop` take no lock: they read
+and replace whole attributes that hold immutable objects (`trajectory`, `target`, `latch`), which Python does atomically,
+and `played_id` has one writer, the tick. A stop therefore takes effect at the next tick whatever else is running, also
+while a chunk is being checked.
 """
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from threading import Lock
 from typing import NamedTuple
 
@@ -21,8 +22,8 @@ from hal.servo.lease import Lease
 from hal.servo.limits import ServoLimits
 from hal.servo.trajectory_buffer import TrajectoryBuffer, extend_buffer, start_buffer
 
-_CHECK_EVERY_S = 0.01
-"""Time between two postures that the guard checks [s]: at full speed a joint turns 0.03 rad in it."""
+_MAX_ID_STEP = 1_000_000
+"""Maximum distance of two trajectories' numbers: one with the largest integer would leave none for the next."""
 
 
 class Snapshot(NamedTuple):
@@ -51,6 +52,13 @@ class Target(NamedTuple):
 
     setpoint: ArmSetpoint
     stamp_s: float
+
+
+class _Stop:
+    """One request to stop, with an identity of its own."""
+
+    def __init__(self, reason: str) -> None:
+        self.reason = reason
 
 
 class CommandMailbox:
@@ -86,6 +94,7 @@ class CommandMailbox:
             """Reason of the last cancellation by a producer."""
             self.blocked_trajectories: dict[int, str] = {}
             """A trajectory of which a later chunk violates the guard, and the text; replaced, not changed."""
+            self._latest_stop = _Stop("")
             self.rearm_pending = False
             """Set by `rearm`, cleared by the tick."""
             self.out_of_limits_count = 0
@@ -126,19 +135,23 @@ class CommandMailbox:
             self.lease.renew(owner, now_s)
 
     def stop(self, reason: str) -> None:
-        """Latch the stop and drop the queue; the first reason stays."""
-        with self._lock:
-            self.latch = self.latch or reason
-            self._cancel(reason)
+        """Latch the stop, which also ends whatever is queued at the next tick; the first reason stays. Never waits."""
+        self._latest_stop = _Stop(reason)  # first: a `rearm` in progress must not clear this stop
+        if not self.latch:
+            self.cancel_reason = reason
+            self.latch = reason
 
     def rearm(self) -> None:
-        """Clear a latched stop and free the lease."""
+        """Clear a latched stop and free the lease; a stop that arrives meanwhile stays."""
         with self._lock:
+            before = self._latest_stop
             if self.latch:
                 self._drop()  # a command may have been accepted while the tick found a fault
                 self.latch = ""
                 self.lease.clear()
                 self.rearm_pending = True
+            if self._latest_stop is not before:
+                self.latch = self.latch or self._latest_stop.reason
 
     def stream(self, chunk: TrajectoryChunk, owner: str | None, now_s: float, snapshot: Snapshot) -> None:
         """Queue `chunk` (errors as `hal.servo.servo.Servo.stream`)."""
@@ -154,6 +167,12 @@ class CommandMailbox:
                     f"servo: trajectory {chunk.trajectory_id} is over ({snapshot.reason or 'played or replaced'}). "
                     f"Start a new one, number {newest + 1} or above.",
                     code="stale_trajectory",
+                )
+            if chunk.trajectory_id > newest + _MAX_ID_STEP:
+                raise CommandRejectedError(
+                    f"servo: trajectory {chunk.trajectory_id} is too far above the last one, {newest} (allowed "
+                    f"{newest + _MAX_ID_STEP}). Number them one by one.",
+                    code="trajectory_id",
                 )
             self._check_start(chunk, snapshot)
             new = start_buffer(chunk, self._limits)
@@ -209,10 +228,11 @@ class CommandMailbox:
     def _check_guard(self, new: TrajectoryBuffer, chunk: TrajectoryChunk, snapshot: Snapshot) -> None:
         if self.guard is None:
             return
-        start_s = float(chunk.t_s[0])
-        violation = self.guard.find_violation(new.sample_positions(start_s, _CHECK_EVERY_S), snapshot.q_sent)
+        # Every setpoint that the ticks will command, from the last one that was checked before.
+        first = max(bisect_left(new.t_s, float(chunk.t_s[0])) - 1, 0)
+        violation = self.guard.find_violation(new.q[first:], snapshot.q_sent)
         if violation is not None:
-            t_s = start_s + violation.index * _CHECK_EVERY_S
+            t_s = new.t_s[first + violation.index]
             raise GuardError(
                 f"guard: trajectory {chunk.trajectory_id} {violation.text} at t = {t_s:.2f} s. Plan inside the "
                 f"workspace.",

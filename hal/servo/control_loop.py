@@ -50,7 +50,7 @@ class ControlCycle:
     ) -> None:
         self._arm, self._limits, self._mailbox = arm, limits, mailbox
         self._heartbeat_timeout_s, self._send_timeout_s = heartbeat_timeout_s, send_timeout_s
-        self._motion = SetpointGenerator(limits, state.q)
+        self._motion = SetpointGenerator(limits, state.q, self._find_violation)
         self._overload = OverloadDetector(limits)
         self._state, self._q_sent = state, state.q
         self._link_lost = self._yield_pending = self._has_yielded = False
@@ -104,10 +104,7 @@ class ControlCycle:
 
     def _latch_fault(self, reason: str) -> None:
         """Latch the stop, as `Servo.stop` does: an operator has to inspect the arm before it moves again."""
-        mailbox = self._mailbox
-        if not mailbox.latch:  # the first reason stays, as in `CommandMailbox.stop`
-            mailbox.cancel_reason = reason
-            mailbox.latch = reason
+        self._mailbox.stop(reason)
 
     # --- Choose the command -------------------------------------------------------------------------------------
 
@@ -129,13 +126,15 @@ class ControlCycle:
             mailbox.finish(newest)
             mailbox.target = None
             if motion.mode is ServoMode.TRACKING:
-                motion.brake(mailbox.latch, newest)
+                motion.brake(mailbox.latch)
         elif active is not None:
             return self._follow_trajectory(active, now_s)
+        elif motion.mode is ServoMode.BRAKING:
+            pass  # a setpoint waits until the arm is at rest
         elif target is not None and now_s - target.stamp_s <= self._send_timeout_s:
             return self._track_target(target.setpoint.q)
         elif motion.mode is ServoMode.TRACKING:
-            motion.brake("" if target else mailbox.cancel_reason, newest)
+            motion.brake("" if target else mailbox.cancel_reason)
             mailbox.target = None
         if self._yield_pending and motion.mode is ServoMode.HOLDING:
             self._yield_pending = False
@@ -145,30 +144,40 @@ class ControlCycle:
     def _follow_trajectory(self, active: TrajectoryBuffer, now_s: float) -> JointCommand:
         """Play the active trajectory; brake on its path at a late heartbeat, a blocked chunk or an underrun."""
         motion, mailbox = self._motion, self._mailbox
-        if active.trajectory_id != motion.trajectory_id:
-            motion.begin(active)
         reason = self._heartbeat_fault(now_s) or mailbox.blocked_trajectories.get(active.trajectory_id, "")
-        if reason or motion.has_underrun(active):
+        is_new = active.trajectory_id != motion.trajectory_id
+        if not reason and not is_new and motion.has_underrun(active):
+            reason = f"trajectory {active.trajectory_id}: buffer underrun at {active.end_s:.3f} s"
+        if reason:
             mailbox.finish(active)
-            reason = reason or f"trajectory {active.trajectory_id}: buffer underrun at {active.end_s:.3f} s"
-            motion.brake(reason, active)
+            if motion.mode is ServoMode.TRACKING:
+                motion.brake(reason)
+            if is_new:
+                motion.skip(active.trajectory_id, reason)
             return motion.brake_or_hold()
+        if is_new and motion.is_moving:  # what moves comes to rest first, on the path that was checked
+            if motion.mode is ServoMode.TRACKING:
+                motion.brake(f"trajectory {active.trajectory_id} replaces the motion")
+            return motion.brake_or_hold()
+        if is_new:
+            motion.begin(active, self._q_sent)
         command = motion.play(active)
-        if motion.finished:
+        if motion.mode is not ServoMode.TRACKING:  # at its end, or stopped by the guard
             mailbox.finish(active)
         return command
 
     def _track_target(self, q_target: np.ndarray) -> JointCommand:
         """Move towards a setpoint; brake while a stop still ends inside the guard's workspace."""
-        motion, guard = self._motion, self._mailbox.guard
-        command = motion.track(q_target)
-        if guard is not None:
-            ahead = np.array([command.q, motion.predict_rest_position()])
-            if violation := guard.find_violation(ahead, self._q_sent):
-                self._mailbox.target = None
-                motion.brake(f"guard: the motion to the setpoint {violation.text}")
-                return motion.brake_or_hold()
+        command = self._motion.track(q_target)
+        if self._motion.mode is not ServoMode.TRACKING:
+            self._mailbox.target = None
         return command
+
+    def _find_violation(self, q: np.ndarray) -> str:
+        """Return how the postures `q` (N, 7) violate the guard; empty when they do not, or without a guard."""
+        guard = self._mailbox.guard
+        violation = guard.find_violation(q, self._q_sent) if guard is not None else None
+        return "" if violation is None else violation.text
 
     def _heartbeat_fault(self, now_s: float) -> str:
         """Return a description of a late heartbeat; empty when it is in time or not required."""
@@ -183,12 +192,20 @@ class ControlCycle:
     def _send_command(self, q: np.ndarray, dq: np.ndarray) -> None:
         """Clip the command, record it as the start of the next one, and send it unless the link is lost."""
         state = self._state
-        allowed = clip_setpoint(self._limits, q, dq, q_last=self._q_sent, q_measured=state.q, dq_measured=state.dq)
+        allowed = clip_setpoint(
+            self._limits,
+            q,
+            dq,
+            q_command=self._motion.q,
+            q_last=self._q_sent,
+            q_measured=state.q,
+            dq_measured=state.dq,
+        )
         self.clipped_count += allowed.clipped
         # The gripper's squeeze limit is left out of the record: the next motion starts from the grip as commanded.
-        recorded = np.minimum(np.maximum(q, self._limits.q_min), self._limits.q_max)
-        recorded[:N_ARM] = allowed.q[:N_ARM]
-        self._motion.update_last_command(recorded, np.append(allowed.dq[:N_ARM], dq[N_ARM]))
+        q_recorded, dq_recorded = allowed.q.copy(), allowed.dq.copy()
+        q_recorded[N_ARM], dq_recorded[N_ARM] = q[N_ARM], dq[N_ARM]
+        self._motion.update_last_command(q_recorded, dq_recorded)
         if self._link_lost:
             return
         try:

@@ -24,6 +24,7 @@ _MAY_MEET_TABLE = np.array([capsule.link in TABLE_LINKS for capsule in CAPSULES]
 _MAY_MEET_GRIPPER = np.array([capsule.link in GRIPPER_OBSTACLES for capsule in CAPSULES])
 AXES = "ZYYYZX"
 """Rotation axis of each arm joint in its own frame."""
+_ROUNDING_M = 1e-9  # a larger value would let repeated attempts creep outwards
 _AXIS = np.array(["XYZ".index(axis) for axis in AXES])
 
 
@@ -127,8 +128,25 @@ def measure_margins(q, joints, lower, upper, T_flange_pivot):
     return box, table, own
 
 
+@njit(cache=True, nogil=True)
+def find_first_outside(q, q_now, joints, lower, upper, T_flange_pivot, allowed):
+    """Return index, boundary and margin [m] of the first of the postures `q` (N, 7) that is outside; index −1 if none.
+
+    `allowed` (3,) are the margins that each boundary needs [m]; less is allowed where `q_now` (7,) has less already.
+    """
+    lowest = np.empty(3)
+    for k in range(-1, len(q)):
+        box, table, own = measure_margins(q_now.reshape(1, 7) if k < 0 else q[k : k + 1], joints, lower, upper, T_flange_pivot)
+        margins = (box[0], table[0], own[0])
+        for i in range(3):
+            if k < 0:
+                lowest[i] = min(allowed[i], margins[i] - _ROUNDING_M)
+            elif margins[i] < lowest[i]:
+                return k, i, margins[i]
+    return -1, 0, 0.0
+
+
 _SLACK_M = 1e-3  # an arm at rest on the boundary may be commanded to stay there
-_ROUNDING_M = 1e-9  # a larger value would let repeated attempts creep outwards
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -189,12 +207,15 @@ class Guard:
     def __init__(self, workspace: Workspace | None = None) -> None:
         self.workspace = workspace or Workspace()
         # Numba takes about a second to load: only a process with a guard waits for it.
-        from hal.servo.guard import measure_margins
+        from hal.servo.guard import find_first_outside, measure_margins
 
-        self._measure = measure_margins
+        self._measure, self._find = measure_margins, find_first_outside
         self._corners = np.array(self.workspace.lower_m), np.array(self.workspace.upper_m)
-        self._joints = _joint_placements()
-        self.compute_margins(np.zeros((1, z1.N_JOINTS)))  # compiled before anything moves
+        self._joints, self._pivot = _joint_placements(), z1.T_FLANGE_PIVOT
+        space = self.workspace
+        self._allowed = np.array([0.0, space.table_m, space.self_m]) - _SLACK_M
+        q = np.zeros((1, z1.N_JOINTS))
+        self.compute_margins(q), self.find_violation(q, q[0])  # compiled before anything moves
 
     def compute_margins(self, q: np.ndarray) -> Margins:
         """Return the margins of postures `q` (N, 7) [rad], in some microseconds each."""
@@ -210,14 +231,13 @@ class Guard:
         An arm that is outside already, at `q_now` (7,), may move as long as it does not get further out: otherwise it
         could never be brought back.
         """
-        now, requested = self.compute_margins(q_now[None]), self.compute_margins(q)
-        earliest: Violation | None = None
-        for here, there, (code, text) in zip(now, requested, _BOUNDARIES, strict=True):
-            outside = np.flatnonzero(there < min(-_SLACK_M, float(here[0]) - _ROUNDING_M))
-            if len(outside) and (earliest is None or outside[0] < earliest.index):
-                first = int(outside[0])
-                earliest = Violation(first, code, text.format(f"{-1e3 * there[first]:.0f}"))
-        return earliest
+        postures, now = np.array(q, dtype=np.float64, order="C"), np.array(q_now, dtype=np.float64)
+        index, which, margin_m = self._find(postures, now, self._joints, *self._corners, self._pivot, self._allowed)
+        if index < 0:
+            return None
+        code, text = _BOUNDARIES[which]
+        allowed_m = self._allowed[which] + _SLACK_M
+        return Violation(index, code, text.format(f"{1e3 * (allowed_m - margin_m):.0f}"))
 
 
 def _joint_placements() -> np.ndarray:

@@ -11,7 +11,12 @@ from hal.base import z1
 from hal.base.errors import InvalidMessageError
 from hal.base.messages import frozen_array
 
+SPEED_TOLERANCE = 1.001
+"""Difference quotients of a motion at full speed exceed it by rounding."""
+SMOOTHNESS_TOLERANCE = 1.05
+"""Cubics through samples of a smooth motion overshoot its acceleration and jerk a little."""
 _GRIPPER = z1.N_ARM
+_ROUNDING_RAD = 1e-9
 _MEASURED = 0  # row of `OverloadDetector._levels`
 
 
@@ -26,9 +31,14 @@ class ServoLimits:
     dq_max: np.ndarray = field(default_factory=lambda: z1.DQ_MAX)
     """(7,) maximum joint speeds [rad/s]."""
     ddq_max: np.ndarray = field(default_factory=lambda: z1.DDQ_MAX)
-    """(7,) maximum joint accelerations, also for braking and blending [rad/s²]."""
+    """(7,) maximum joint accelerations of a motion [rad/s²]."""
     dddq_max: np.ndarray = field(default_factory=lambda: z1.DDDQ_MAX)
-    """(7,) maximum joint jerks, also for braking [rad/s³]."""
+    """(7,) maximum joint jerks of a motion [rad/s³]."""
+    brake_ddq_max: np.ndarray = field(default_factory=lambda: 3.0 * z1.DDQ_MAX)
+    """(7,) maximum joint accelerations of a stop [rad/s²]. A motion at full speed cannot end within `brake_s` at
+    `ddq_max`; three times as much is what slowing down on its path needs (`path_stop_peaks`)."""
+    brake_dddq_max: np.ndarray = field(default_factory=lambda: 6.0 * z1.DDDQ_MAX)
+    """(7,) maximum joint jerks of a stop [rad/s³]; six times `dddq_max` for the same reason."""
     tau_max: np.ndarray = field(default_factory=lambda: z1.TAU_MAX)
     """(7,) maximum motor torques [Nm]."""
     grip_torque_nm: float = 3.0
@@ -47,8 +57,8 @@ class ServoLimits:
     overload_s: float = 0.1
     """See `overload_fraction` [s]."""
     brake_s: float = 0.24
-    """Maximum duration of braking; where `ddq_max` is too little for it, the servo brakes harder [s]. With the
-    heartbeat timeout of 0.15 s (`hal.process`) the command is at rest within 0.4 s of the owner's last heartbeat."""
+    """Maximum duration of a stop [s]; a slower motion takes less, at the motion's own limits. With the heartbeat
+    timeout of 0.15 s (`hal.process`) the command is at rest within 0.4 s of the owner's last heartbeat."""
 
     def __post_init__(self) -> None:
         for entry in fields(self):
@@ -64,6 +74,25 @@ class ServoLimits:
             raise InvalidMessageError(
                 f"ServoLimits.q_min {self.q_min} must be below q_max {self.q_max}.", code="invalid_limit"
             )
+        for name, needed in zip(("brake_ddq_max", "brake_dddq_max"), path_stop_peaks(self), strict=True):
+            if (needed > SMOOTHNESS_TOLERANCE * getattr(self, name)).any():
+                raise InvalidMessageError(
+                    f"ServoLimits.{name} is {getattr(self, name)}; a stop from dq_max within brake_s needs {needed}.",
+                    code="invalid_limit",
+                )
+
+
+def path_stop_peaks(limits: ServoLimits) -> tuple[np.ndarray, np.ndarray]:
+    """Return bounds (7,) of acceleration [rad/s²] and jerk [rad/s³] of every stop on the path of a legal motion.
+
+    The stop slows the path's time down by 1 − 3u² + 2u³, u = t / `brake_s` (`hal.servo.path_stop`).
+    """
+    u = np.linspace(0.0, 1.0, 101)[:, None]
+    rate, slope, bend = 1 - 3 * u**2 + 2 * u**3, 6 * u * (1 - u) / limits.brake_s, (6 - 12 * u) / limits.brake_s**2
+    v, a, j = limits.dq_max, limits.ddq_max, limits.dddq_max
+    acceleration = a * rate**2 + v * slope
+    jerk = j * rate**3 + 3 * a * rate * slope + v * np.abs(bend)
+    return acceleration.max(axis=0), jerk.max(axis=0)
 
 
 class ClippedSetpoint(NamedTuple):
@@ -82,6 +111,7 @@ def clip_setpoint(
     q: np.ndarray,
     dq: np.ndarray,
     *,
+    q_command: np.ndarray,
     q_last: np.ndarray,
     q_measured: np.ndarray,
     dq_measured: np.ndarray,
@@ -96,25 +126,32 @@ def clip_setpoint(
         limits: the limits.
         q: (7,) desired positions [rad].
         dq: (7,) desired velocities [rad/s].
+        q_command: (7,) command of the tick before, which the arm itself may have limited further [rad]. A joint that
+            is outside its limits, as one that rests on its stop may be by the error of its encoder, stays there.
         q_last: (7,) setpoint of the tick before [rad].
         q_measured: (7,) newest measured positions [rad].
         dq_measured: (7,) newest measured velocities [rad/s].
     """
-    allowed = np.minimum(np.maximum(q, limits.q_min), limits.q_max)
-    velocity = np.minimum(np.maximum(dq, -limits.dq_max), limits.dq_max)
-    # The motors' servos add damping times this speed: at a position limit it would push beyond it.
-    velocity[allowed != q] = 0.0
     lead_rad = limits.grip_torque_nm / z1.KP[_GRIPPER]
     # A measured speed beyond the joint's own is an error of measurement and must not extend the lead.
     on_rad = min(max(dq_measured[_GRIPPER], -limits.dq_max[_GRIPPER]), limits.dq_max[_GRIPPER]) * limits.gripper_lag_s
     low, high = q_measured[_GRIPPER] - lead_rad + min(on_rad, 0.0), q_measured[_GRIPPER] + lead_rad + max(on_rad, 0.0)
+    step = SPEED_TOLERANCE * limits.dq_max * z1.CONTROL_PERIOD_S
+    lowest = np.maximum(np.minimum(limits.q_min, q_command), q_last - step)
+    highest = np.minimum(np.maximum(limits.q_max, q_command), q_last + step)
+    velocity = np.minimum(np.maximum(dq, -limits.dq_max), limits.dq_max)
+    # As at nearly every tick; `&` of two arrays and one `all` are half the time of what follows.
+    if low <= q[_GRIPPER] <= high and ((q >= lowest) & (q <= highest)).all():
+        return ClippedSetpoint(q.copy(), velocity, False)
+    allowed = np.minimum(np.maximum(q, np.minimum(limits.q_min, q_command)), np.maximum(limits.q_max, q_command))
+    # The motors' servos add damping times this speed: at a position limit it would push beyond it.
+    velocity[allowed != q] = 0.0
     grip = min(max(allowed[_GRIPPER], low), high)
     if grip != allowed[_GRIPPER]:
         allowed[_GRIPPER] = grip
         velocity[_GRIPPER] = 0.0
-    step = limits.dq_max * z1.CONTROL_PERIOD_S
     allowed = np.minimum(np.maximum(allowed, q_last - step), q_last + step)
-    clipped = bool((np.abs(allowed - q)[:_GRIPPER] > 1e-9).any())  # 1e-9 rad: rounding of the step
+    clipped = bool((np.abs(allowed - q)[:_GRIPPER] > _ROUNDING_RAD).any())
     return ClippedSetpoint(allowed, velocity, clipped)
 
 

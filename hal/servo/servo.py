@@ -11,6 +11,9 @@ mailbox's immutable entries, and publishes one immutable snapshot.
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from hal.base.clock import Clock
@@ -24,6 +27,8 @@ from hal.servo.status import PeriodStatistics, StatusLogger, make_health, make_s
 
 if TYPE_CHECKING:
     from hal.base.arm import Arm
+
+log = logging.getLogger(__name__)
 
 _STATE_MAX_AGE_S = 0.2  # 100 ticks; `BusConfig.state_max_age_s` is the same for clients
 
@@ -153,7 +158,10 @@ class Servo:
         self._mailbox.renew(owner, self.clock.now_s())
 
     def stop(self, reason: str = "stop requested") -> None:
-        """Brake at the next tick, then hold; all commands are rejected until `rearm()`. Queued motion is dropped."""
+        """Brake at the next tick, then hold; all commands are rejected until `rearm()`. Queued motion is dropped.
+
+        Waits for nothing, also not for another client's command that is being checked.
+        """
         self._mailbox.stop(reason)
 
     def fail(self, reason: str) -> None:
@@ -185,7 +193,8 @@ class Servo:
             raise CommandRejectedError(
                 f"servo: stream() takes a TrajectoryChunk, not a {type(chunk).__name__}.", code="wrong_type"
             )
-        self._mailbox.stream(chunk, owner, self.clock.now_s(), snapshot)
+        with _own_error("the chunk"):
+            self._mailbox.stream(chunk, owner, self.clock.now_s(), snapshot)
 
     def send(self, setpoint: ArmSetpoint, owner: str | None = None) -> ArmSetpoint:
         """Move towards one setpoint within all limits; return it clipped to the joint limits and to one tick's step.
@@ -203,11 +212,13 @@ class Servo:
             raise CommandRejectedError(
                 f"servo: send() takes an ArmSetpoint, not a {type(setpoint).__name__}.", code="wrong_type"
             )
-        self._mailbox.send(setpoint, owner, self.clock.now_s(), snapshot)
+        with _own_error("the setpoint"):
+            self._mailbox.send(setpoint, owner, self.clock.now_s(), snapshot)
         allowed = clip_setpoint(
             self.limits,
             setpoint.q,
             setpoint.dq,
+            q_command=snapshot.q_desired,
             q_last=snapshot.q_sent,
             q_measured=snapshot.state.q,
             dq_measured=snapshot.state.dq,
@@ -242,3 +253,23 @@ class Servo:
         now_s = self.clock.now_s()
         self.periods.record(now_s)
         self._snapshot = self._cycle.run(now_s)
+
+
+@contextmanager
+def _own_error(what: str) -> Iterator[None]:
+    """Turn an unforeseen error into a rejection of the one request that met it.
+
+    Raises:
+        CommandRejectedError: instead of any error that is no `HalError` (`internal_error`).
+    """
+    try:
+        yield
+    except HalError:
+        raise
+    except Exception as error:  # every type: a defect must not end the process that holds the arm
+        log.exception("servo: an unforeseen error rejected %s", what)
+        raise CommandRejectedError(
+            f"servo: {what} was not accepted, because of an error in the servo ({type(error).__name__}: {error}). The "
+            f"arm goes on as before. Report it with the log of the HAL.",
+            code="internal_error",
+        ) from error

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 _FIFO_PRIORITY = 80  # above the twin's controller thread (70), which answers the servo
+_MAX_FAILURES = 5  # in a row: 10 ms without a command, hardly more than the wire loses by itself
 _SWITCH_INTERVAL_S = 0.0005  # a quarter of a period; CPython's default of 5 ms would miss two ticks
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4  # <sys/mman.h>
 
@@ -28,8 +29,9 @@ _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4  # <sys/mman.h>
 class ServoThread(BackgroundLoop):
     """A daemon thread that calls `servo.tick()` every control period, in a `with` block or by `start` and `stop`.
 
-    A late tick shifts all later deadlines: no period is skipped and none is caught up in a burst. After an error in
-    a tick the stop is latched, the arm itself is stopped, and `stop` raises the error.
+    A late tick shifts all later deadlines: no period is skipped and none is caught up in a burst. An error in a tick
+    latches the stop, with the error as its reason, and the ticks go on: they brake and hold, while an arm that gets no
+    commands may go limp. After a few errors in a row the arm itself is stopped, and `stop` raises the last one.
 
     Args:
         servo: connected before the start.
@@ -49,7 +51,7 @@ class ServoThread(BackgroundLoop):
             self._servo.periods.set_measuring(True)
             self._run_ticks()
         except Exception as error:  # every type: whatever ends the ticks, the arm must be stopped
-            self._servo.fail(f"the servo's tick failed: {type(error).__name__}: {error}")
+            self._servo.fail(_describe(error))
             raise
         finally:
             self._servo.periods.set_measuring(False)
@@ -58,15 +60,27 @@ class ServoThread(BackgroundLoop):
 
     def _run_ticks(self) -> None:
         clock, tick, stop_requested = self._clock, self._servo.tick, self._stop_requested.is_set
-        deadline_s = clock.now_s()
+        deadline_s, failures = clock.now_s(), 0
         while not stop_requested():
             clock.sleep_until(deadline_s)
             late_s = clock.now_s() - deadline_s
             # Less than half a period of jitter is absorbed by the next deadline; more shifts the whole schedule.
             if late_s > 0.5 * CONTROL_PERIOD_S:
                 deadline_s += late_s
-            tick()
+            try:
+                tick()
+                failures = 0
+            except Exception as error:  # every type: the next tick brakes, where this one may have met a defect
+                failures += 1
+                if failures > _MAX_FAILURES:
+                    raise
+                self._servo.stop(_describe(error))
+                log.exception("the servo's tick failed")
             deadline_s += CONTROL_PERIOD_S
+
+
+def _describe(error: Exception) -> str:
+    return f"the servo's tick failed: {type(error).__name__}: {error}"
 
 
 def _request_real_time(cpu: int | None) -> tuple[str, ...]:

@@ -73,18 +73,19 @@ class PeriodStatistics:
         Partitioning the ring takes the interpreter from the tick, so the result is cached for `_SUMMARY_TICKS`;
         `np.percentile` would take 57 ms for its first call.
         """
-        if self._filled and self.ticks >= self._due_ticks:
+        filled = self._filled  # read once: the tick may fill another place at any time
+        if filled and self.ticks >= self._due_ticks:
             self._due_ticks = self.ticks + _SUMMARY_TICKS
-            ring_s = self._ring_s[: self._filled]
-            ranks = [round(quantile * (self._filled - 1)) for quantile in (0.5, 0.99, 0.999, 1.0)]
+            ring_s = self._ring_s[:filled]
+            ranks = [round(quantile * (filled - 1)) for quantile in (0.5, 0.99, 0.999, 1.0)]
             parted_ms = 1e3 * np.partition(ring_s, ranks)[ranks]  # nearest rank
-            self._summary = PeriodSummary(self._filled / float(ring_s.sum()), *parted_ms.tolist())
+            self._summary = PeriodSummary(filled / float(ring_s.sum()), *parted_ms.tolist())
         return self._summary
 
 
 log = logging.getLogger(__name__)
 
-_WARNING_PERIOD_S = 1.0  # a clipped stream clips at 500 Hz: one line a second is enough to read
+_EPISODE_GAP_S = 1.0  # without a clipped setpoint for so long, the next one begins another episode
 
 
 def make_status(snapshot: Snapshot, mailbox: CommandMailbox, periods: PeriodStatistics, now_s: float) -> ServoStatus:
@@ -137,12 +138,12 @@ def make_health(
 
 
 class StatusLogger:
-    """Logger of latched stops, once each, and of clipped setpoints, once a second; run by each status request."""
+    """Logger of latched stops and of episodes of clipped setpoints, once each; run by each status request."""
 
     def __init__(self) -> None:
         self._latch = ""
         self._clipped_count = 0
-        self._logged_s = -np.inf  # the first clipped setpoint is logged at once
+        self._clipped_s = -np.inf  # of the last change of the count
 
     def log_changes(self, latch: str, clipped_count: int, now_s: float) -> None:
         """Log the changes since the last call.
@@ -155,6 +156,11 @@ class StatusLogger:
         if latch != self._latch:
             self._latch = latch
             log.info("servo: %s", f"stopped: {latch}" if latch else "re-armed")
-        if clipped_count != self._clipped_count and now_s - self._logged_s >= _WARNING_PERIOD_S:
-            log.warning("servo: %d setpoints were clipped to the limits.", clipped_count - self._clipped_count)
-            self._clipped_count, self._logged_s = clipped_count, now_s
+        if clipped_count != self._clipped_count:
+            if now_s - self._clipped_s > _EPISODE_GAP_S:
+                log.warning(
+                    "servo: the arm does not go where it is commanded: setpoints are beyond its joint limits or its "
+                    "speed, and it moves to the nearest that is allowed. Check the targets of the client. The next "
+                    "line like this is about another episode."
+                )
+            self._clipped_count, self._clipped_s = clipped_count, now_s

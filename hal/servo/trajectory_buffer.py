@@ -1,7 +1,8 @@
-"""Buffer of the trajectory being played: checked chunks joined end to end, interpolated at any time.
+"""Buffer of the trajectory being played: checked chunks joined end to end and resampled to the ticks.
 
 `start_buffer` and `extend_buffer` run in the producers' threads and reject a chunk that breaks a limit before the tick
-can read any of it.
+can read any of it. They check the setpoints that the ticks will command, one each control period from time 0, whatever
+the times of the chunk's own points are.
 """
 
 from __future__ import annotations
@@ -13,18 +14,21 @@ import numpy as np
 
 from hal.base.errors import CommandRejectedError
 from hal.base.messages import TrajectoryChunk
-from hal.base.z1 import CONTROL_PERIOD_S, JOINT_NAMES
-from hal.servo.limits import ServoLimits
+from hal.base.z1 import CONTROL_PERIOD_S, JOINT_NAMES, N_JOINTS
+from hal.servo.limits import SMOOTHNESS_TOLERANCE, SPEED_TOLERANCE, ServoLimits
+from hal.servo.path_stop import path_stop_durations
 
 MAX_GAP_S = 0.05
 """Maximum time between the end of one chunk and the start of the next [s]."""
+MAX_BUFFER_S = 20.0
+"""Maximum duration of the buffered part of a trajectory [s]."""
 MAX_POINTS = 10_000
-"""Maximum number of buffered points: 20 s at the servo's rate. Checking more would delay a stop."""
+"""Maximum number of points of a chunk: `MAX_BUFFER_S` at the servo's rate."""
 _SAME_TIME_S = 1e-6  # rounding of times; a control period is 2000 times as long
+_ROUNDING_S = 1e-9  # of a sum of thousands of periods
 _KEEP_S = 0.1  # of played points: the tick may still read the buffer a few periods behind the producer
 _POSITION_TOLERANCE_RAD = 1e-6  # rounding of a point on a joint limit
-_SPEED_TOLERANCE = 1.001  # difference quotients of a motion at full speed exceed it by rounding
-_SMOOTHNESS_TOLERANCE = 1.05  # cubics through samples of a smooth motion overshoot its acceleration a little
+_REST_ROWS = 3  # a third difference spans as many control periods
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -34,13 +38,15 @@ class TrajectoryBuffer:
     trajectory_id: int
     """Identifier of the trajectory."""
     t_s: list[float]
-    """(N,) times [s]; a list, which bisects faster than an array."""
+    """(N,) times [s], multiples of the control period, and the end; a list, which bisects faster than an array."""
     q: np.ndarray
     """(N, 7) positions [rad]."""
     dq: np.ndarray
     """(N, 7) velocities [rad/s]."""
     final: bool
-    """True when the last point is the end of the trajectory."""
+    """True when the last point is the end of the trajectory, where it is at rest."""
+    stop_s: np.ndarray
+    """(N,) duration of a stop on the path that begins at each point [s]."""
 
     @property
     def end_s(self) -> float:
@@ -53,6 +59,10 @@ class TrajectoryBuffer:
         if i == 0 or i == len(self.t_s):
             i = max(i - 1, 0)
             return self.q[i], self.dq[i]
+        if t_s - self.t_s[i - 1] < _ROUNDING_S:  # a tick that plays the trajectory meets its points
+            return self.q[i - 1], self.dq[i - 1]
+        if self.t_s[i] - t_s < _ROUNDING_S:
+            return self.q[i], self.dq[i]
         h = self.t_s[i] - self.t_s[i - 1]
         s = (t_s - self.t_s[i - 1]) / h
         a, b = self.q[i - 1], self.q[i]
@@ -63,25 +73,32 @@ class TrajectoryBuffer:
         dq = (6 * s * (1 - s) / h) * rise + (1 - s) * (1 - 3 * s) * da + s * (3 * s - 2) * db
         return q, dq
 
-    def sample_positions(self, start_s: float, spacing_s: float) -> np.ndarray:
-        """Return positions (N, 7) [rad] every `spacing_s` [s] from `start_s` [s] to the end, the end included."""
-        times = np.arange(start_s, self.end_s, spacing_s)
-        return np.array([self.at(float(t_s))[0] for t_s in (*times, self.end_s)])
+    def stop_duration(self, t_s: float) -> float:
+        """Return the duration of a stop on the path that begins at `t_s` [s]."""
+        return float(self.stop_s[max(bisect_right(self.t_s, t_s + _SAME_TIME_S) - 1, 0)])
+
+    def can_stop_from(self, t_s: float) -> bool:
+        """Return True when a stop that begins at `t_s` [s] ends on the buffered path."""
+        # A stop advances the path's own time by half its duration; a complete trajectory ends at rest anyway.
+        return self.final or t_s + 0.5 * self.stop_duration(t_s) <= self.end_s + _SAME_TIME_S
 
 
 def start_buffer(chunk: TrajectoryChunk, limits: ServoLimits) -> TrajectoryBuffer:
     """Return the buffer of a new trajectory with its first chunk.
 
     Raises:
-        CommandRejectedError: it does not start at time 0 (`first_chunk_time`), or breaks a limit (see `extend_buffer`).
+        CommandRejectedError: it does not start at time 0 (`first_chunk_time`) or not at rest (`starts_in_motion`), or
+            breaks a limit (see `extend_buffer`).
     """
     if abs(chunk.t_s[0]) > _SAME_TIME_S:
         raise CommandRejectedError(
             f"servo: trajectory {chunk.trajectory_id} starts at {chunk.t_s[0]:.4f} s. Start its first chunk at 0.",
             code="first_chunk_time",
         )
-    _check_points(chunk.trajectory_id, chunk.t_s, chunk.q, chunk.dq, limits)
-    return TrajectoryBuffer(chunk.trajectory_id, chunk.t_s.tolist(), chunk.q, chunk.dq, chunk.final)
+    _check_size(chunk, 0.0)
+    t_s, q, dq = _resample(chunk.t_s, chunk.q, chunk.dq, 0, chunk.final)
+    _check_points(chunk, t_s, q, dq, limits, first=True)
+    return TrajectoryBuffer(chunk.trajectory_id, t_s.tolist(), q, dq, chunk.final, path_stop_durations(dq, limits))
 
 
 def extend_buffer(
@@ -91,8 +108,9 @@ def extend_buffer(
 
     Raises:
         CommandRejectedError: the trajectory is complete (`trajectory_complete`), the chunk leaves a gap or overlaps
-            (`chunk_gap`), jumps at the seam (`position_jump`), is too long (`buffer_full`), or breaks a limit
-            (`joint_limit`, `speed_limit`, `acceleration_limit`, `jerk_limit`).
+            (`chunk_gap`), jumps at the seam (`position_jump`), is too long (`buffer_full`), breaks a limit
+            (`joint_limit`, `speed_limit`, `acceleration_limit`, `jerk_limit`), or is final and does not end at rest
+            (`ends_in_motion`).
     """
     if old.final:
         raise CommandRejectedError(
@@ -118,61 +136,140 @@ def extend_buffer(
             code="position_jump",
         )
     keep = max(bisect_right(old.t_s, played_s - _KEEP_S) - 1, 0)
-    t_s = np.concatenate([old.t_s[keep:], chunk.t_s[skip:]])
-    q = np.concatenate([old.q[keep:], chunk.q[skip:]])
-    dq = np.concatenate([old.dq[keep:], chunk.dq[skip:]])
-    _check_points(chunk.trajectory_id, t_s, q, dq, limits)
-    return TrajectoryBuffer(chunk.trajectory_id, t_s.tolist(), q, dq, chunk.final)
+    _check_size(chunk, old.t_s[keep])
+    # The last point may be between two ticks: it is a knot of the new part, and no longer a point of the buffer.
+    on_tick = len(old.t_s) - int(_tick_of(old.end_s) * CONTROL_PERIOD_S < old.end_s - _SAME_TIME_S)
+    knots = [np.append(old.end_s, chunk.t_s[skip:]), *(np.vstack([a[-1], b[skip:]]) for a, b in _pairs(old, chunk))]
+    t_s, q, dq = _resample(*knots, _tick_of(old.end_s) + 1, chunk.final)
+    t_s = np.concatenate([old.t_s[keep:on_tick], t_s])
+    q, dq = np.concatenate([old.q[keep:on_tick], q]), np.concatenate([old.dq[keep:on_tick], dq])
+    seam = max(on_tick - keep - 1 - _REST_ROWS, 0)
+    _check_points(chunk, t_s[seam:], q[seam:], dq[seam:], limits)
+    stop_s = path_stop_durations(dq, limits)
+    return TrajectoryBuffer(chunk.trajectory_id, t_s.tolist(), q, dq, chunk.final, stop_s)
 
 
-def _check_points(trajectory_id: int, t_s: np.ndarray, q: np.ndarray, dq: np.ndarray, limits: ServoLimits) -> None:
-    """Reject a buffer that is too long or breaks a limit of position, speed, acceleration or jerk."""
-    if len(t_s) > MAX_POINTS:
+def _pairs(old: TrajectoryBuffer, chunk: TrajectoryChunk) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
+    return (old.q, chunk.q), (old.dq, chunk.dq)
+
+
+def _tick_of(t_s: float) -> int:
+    """Return the number of the last tick that is not after `t_s` [s]."""
+    return int((t_s + _SAME_TIME_S) / CONTROL_PERIOD_S)
+
+
+def _check_size(chunk: TrajectoryChunk, first_s: float) -> None:
+    """Reject a chunk that is too long, before anything is computed from it."""
+    duration_s, points = float(chunk.t_s[-1]) - first_s, len(chunk.t_s)
+    if points > MAX_POINTS or not duration_s <= MAX_BUFFER_S:
         raise CommandRejectedError(
-            f"servo: trajectory {trajectory_id} would have {len(t_s)} points buffered (allowed {MAX_POINTS}). "
-            f"Send it in chunks, about 0.2 s before they are due.",
+            f"servo: trajectory {chunk.trajectory_id} would have {duration_s:.4g} s buffered after a chunk of {points} "
+            f"points (allowed {MAX_BUFFER_S:g} s and {MAX_POINTS} points). Send it in chunks, about 0.3 s before they "
+            f"are due.",
             code="buffer_full",
         )
+
+
+def _resample(
+    t_s: np.ndarray, q: np.ndarray, dq: np.ndarray, first: int, final: bool
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the cubic through the knots (K,), (K, 7), (K, 7) at the ticks from number `first`.
+
+    The end is a point of its own where it is between two ticks; a complete trajectory holds it until the next tick.
+    """
+    end_s = float(t_s[-1])
+    last = _tick_of(end_s)
+    ragged = last * CONTROL_PERIOD_S < end_s - _SAME_TIME_S
+    at_s = np.arange(first, last + 1 + int(ragged and final)) * CONTROL_PERIOD_S
+    if ragged and not final:
+        at_s = np.append(at_s, end_s)
+    knots = t_s[len(t_s) - len(at_s) :]
+    # As planned at the servo's rate, nothing is interpolated: the command is what was sent, to the last bit.
+    if len(knots) == len(at_s) and (np.abs(knots - at_s) < 1e-9).all():
+        n = len(t_s) - len(at_s)
+        return at_s, q[n:], dq[n:]
+    if len(t_s) == 1:
+        return at_s, np.tile(q, (len(at_s), 1)), np.tile(dq, (len(at_s), 1))
+    i = np.clip(np.searchsorted(t_s, at_s, side="right"), 1, len(t_s) - 1)
+    h = (t_s[i] - t_s[i - 1])[:, None]
+    s = np.clip((at_s - t_s[i - 1])[:, None] / h, 0.0, 1.0)
+    rise = q[i] - q[i - 1]
+    a = q[i - 1] + s * s * (3 - 2 * s) * rise + (h * s * (1 - s)) * ((1 - s) * dq[i - 1] - s * dq[i])
+    da = (6 * s * (1 - s) / h) * rise + (1 - s) * (1 - 3 * s) * dq[i - 1] + s * (3 * s - 2) * dq[i]
+    return at_s, a, da
+
+
+def _check_points(
+    chunk: TrajectoryChunk,
+    t_s: np.ndarray,
+    q: np.ndarray,
+    dq: np.ndarray,
+    limits: ServoLimits,
+    *,
+    first: bool = False,
+) -> None:
+    """Reject points that break a limit of position, speed, acceleration or jerk, or that begin or end in motion."""
     outside = np.maximum(limits.q_min - q, q - limits.q_max)
-    if outside.max() > _POSITION_TOLERANCE_RAD:
+    if not outside.max() <= _POSITION_TOLERANCE_RAD:
         i, j = np.unravel_index(int(outside.argmax()), outside.shape)
         raise CommandRejectedError(
-            f"servo: trajectory {trajectory_id} moves {JOINT_NAMES[j]} to {q[i, j]:.4f} rad at t = {t_s[i]:.3f} s "
-            f"(allowed {limits.q_min[j]:.4f} to {limits.q_max[j]:.4f} rad). Plan within the joint limits.",
+            f"servo: trajectory {chunk.trajectory_id} moves {JOINT_NAMES[j]} to {q[i, j]:.4f} rad at t = {t_s[i]:.3f} "
+            f"s (allowed {limits.q_min[j]:.4f} to {limits.q_max[j]:.4f} rad). Plan within the joint limits.",
             code="joint_limit",
         )
-    speed = np.abs(dq)
-    if len(t_s) > 1:
-        speed = np.vstack([speed, np.abs(np.diff(q, axis=0)) / np.diff(t_s)[:, None]])
-    excess = speed / limits.dq_max
-    if excess.max() > _SPEED_TOLERANCE:
-        i, j = np.unravel_index(int(excess.argmax()), excess.shape)
-        raise CommandRejectedError(
-            f"servo: trajectory {trajectory_id} moves {JOINT_NAMES[j]} at {speed[i, j]:.3f} rad/s (allowed "
-            f"{limits.dq_max[j]:.3f} rad/s). Slow it down.",
-            code="speed_limit",
-        )
-    if len(t_s) > 1:
-        _check_smoothness(trajectory_id, t_s, q, dq, limits)
-
-
-def _check_smoothness(trajectory_id: int, t_s: np.ndarray, q: np.ndarray, dq: np.ndarray, limits: ServoLimits) -> None:
-    """Reject accelerations and jerks of the interpolated cubics (`TrajectoryBuffer.at`) beyond the limits."""
-    h = np.diff(t_s)[:, None]
-    slope = np.diff(q, axis=0) / h
-    before = (6.0 * slope - 4.0 * dq[:-1] - 2.0 * dq[1:]) / h
-    after = (2.0 * dq[:-1] + 4.0 * dq[1:] - 6.0 * slope) / h
-    # Between two cubics the acceleration may jump; the jerk of such a jump is averaged over both.
-    mean = (np.diff(dq, axis=0)) / h
-    jerk = np.diff(mean, axis=0) / (0.5 * (h[1:] + h[:-1]))
-    for name, values, allowed, unit in (
-        ("acceleration", np.maximum(np.abs(before), np.abs(after)), limits.ddq_max, "rad/s²"),
-        ("jerk", np.abs(jerk), limits.dddq_max, "rad/s³"),
-    ):
-        if len(values) and (values / allowed).max() > _SMOOTHNESS_TOLERANCE:
-            i, j = np.unravel_index(int((values / allowed).argmax()), values.shape)
+    # Before its start and after its end the arm is at rest: these rows make the checks below cover both.
+    rest = np.zeros((_REST_ROWS, N_JOINTS))
+    before = _REST_ROWS if first else 0
+    if first:
+        _check_rest(chunk, dq[0], limits, "starts")
+        q, dq = np.concatenate([rest + q[0], q]), np.concatenate([rest, dq])
+    if chunk.final:
+        _check_rest(chunk, dq[-1], limits, "ends")
+        q, dq = np.concatenate([q, rest + q[-1]]), np.concatenate([dq, rest])
+    elif len(t_s) > 1 and t_s[-1] - t_s[-2] < CONTROL_PERIOD_S - _SAME_TIME_S:
+        q, dq = q[:-1], dq[:-1]  # the end between two ticks, which is checked when it is extended
+    for name, values, allowed, unit in _rates(q, dq, limits):
+        excess = np.abs(values) / allowed
+        if len(values) and not excess.max() <= 1.0:
+            i, j = np.unravel_index(int(excess.argmax()), excess.shape)
+            at_s = t_s[min(max(int(i) - before, 0), len(t_s) - 1)]
             raise CommandRejectedError(
-                f"servo: trajectory {trajectory_id} has {name} {values[i, j]:.1f} {unit} of {JOINT_NAMES[j]} at t = "
-                f"{t_s[i]:.3f} s (allowed {allowed[j]:.1f} {unit}). Slow it down, or smooth it.",
+                f"servo: trajectory {chunk.trajectory_id} has {name} {values[i, j]:.1f} {unit} of {JOINT_NAMES[j]} at "
+                f"t = {at_s:.3f} s (allowed {allowed[j]:.1f} {unit}). Slow it down, smooth it, or send it with points "
+                f"every 0.002 s.",
                 code=f"{name}_limit",
             )
+
+
+def _rates(
+    q: np.ndarray, dq: np.ndarray, limits: ServoLimits
+) -> list[tuple[str, np.ndarray, np.ndarray, str]]:
+    """Return name, values (N, 7), limits (7,) and unit of the rates of the points and of the cubics between them."""
+    h = CONTROL_PERIOD_S
+    slope = np.diff(q, axis=0) / h
+    begin = (6.0 * slope - 4.0 * dq[:-1] - 2.0 * dq[1:]) / h
+    end = (2.0 * dq[:-1] + 4.0 * dq[1:] - 6.0 * slope) / h
+    # A stop samples the cubics more densely than the ticks, and meets the steps of acceleration between them.
+    steps = (begin[1:] - end[:-1]) / h
+    ddq_max, dddq_max = SMOOTHNESS_TOLERANCE * limits.ddq_max, SMOOTHNESS_TOLERANCE * limits.dddq_max
+    return [
+        ("speed", dq, SPEED_TOLERANCE * limits.dq_max, "rad/s"),
+        ("speed", slope, SPEED_TOLERANCE * limits.dq_max, "rad/s"),
+        ("acceleration", begin, ddq_max, "rad/s²"),
+        ("acceleration", end, ddq_max, "rad/s²"),
+        ("jerk", np.diff(slope, n=2, axis=0) / h**2, dddq_max, "rad/s³"),
+        ("jerk", steps, 2.0 * dddq_max, "rad/s³"),
+    ]
+
+
+def _check_rest(chunk: TrajectoryChunk, dq: np.ndarray, limits: ServoLimits, verb: str) -> None:
+    """Reject a first or last point in motion: the arm is at rest before the one and after the other."""
+    allowed = SMOOTHNESS_TOLERANCE * limits.dddq_max * CONTROL_PERIOD_S**2  # the speed that the jerk gives in one tick
+    if (np.abs(dq) <= allowed).all():
+        return
+    j = int((np.abs(dq) / allowed).argmax())
+    raise CommandRejectedError(
+        f"servo: trajectory {chunk.trajectory_id} {verb} with {dq[j]:.4f} rad/s of {JOINT_NAMES[j]} (allowed "
+        f"{allowed[j]:.4f} rad/s). Plan it from rest to rest.",
+        code=f"{verb}_in_motion",
+    )

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from hal.base.errors import InvalidMessageError
-from hal.base.z1 import CONTROL_PERIOD_S, DQ_MAX, KP, N_ARM, N_JOINTS, Q_MAX, Q_MIN
+from hal.base.z1 import CONTROL_PERIOD_S, DDQ_MAX, DQ_MAX, KP, N_ARM, N_JOINTS, Q_MAX, Q_MIN
 from hal.servo.limits import (
+    SPEED_TOLERANCE,
     ClippedSetpoint,
     OverloadDetector,
     ServoLimits,
@@ -25,7 +26,9 @@ ZERO = np.zeros(N_JOINTS)
 def clip(
     q: np.ndarray, dq: np.ndarray, q_last: np.ndarray, q_measured: np.ndarray, dq_measured: np.ndarray = ZERO
 ) -> ClippedSetpoint:
-    return clip_setpoint(LIMITS, q, dq, q_last=q_last, q_measured=q_measured, dq_measured=dq_measured)
+    return clip_setpoint(
+        LIMITS, q, dq, q_command=MIDDLE, q_last=q_last, q_measured=q_measured, dq_measured=dq_measured
+    )
 
 
 def test_a_setpoint_within_the_limits_is_unchanged() -> None:
@@ -38,7 +41,7 @@ def test_a_setpoint_within_the_limits_is_unchanged() -> None:
 
 def test_a_step_is_no_faster_than_the_joints() -> None:
     allowed = clip(MIDDLE + 0.5, ZERO + 9.0, MIDDLE, MIDDLE)
-    assert allowed.q == pytest.approx(MIDDLE + DQ_MAX * CONTROL_PERIOD_S)
+    assert allowed.q == pytest.approx(MIDDLE + SPEED_TOLERANCE * DQ_MAX * CONTROL_PERIOD_S)
     assert allowed.dq[:N_ARM] == pytest.approx(DQ_MAX[:N_ARM])
     assert allowed.clipped
 
@@ -77,7 +80,7 @@ def test_a_moving_jaw_may_be_led_further_by_the_distance_of_its_latency(side: fl
     assert ahead.q[N_ARM] == desired[N_ARM]
     assert ahead.dq[N_ARM] == side * 2.0
     behind = clip(desired, moving, desired, MIDDLE, -moving)  # against its motion the torque alone leads it
-    at_most = DQ_MAX[N_ARM] * CONTROL_PERIOD_S
+    at_most = SPEED_TOLERANCE * DQ_MAX[N_ARM] * CONTROL_PERIOD_S
     assert side * (behind.q - MIDDLE)[N_ARM] == pytest.approx(max(3.0 / KP[N_ARM], 0.06 - at_most))
 
 
@@ -89,13 +92,31 @@ def test_a_measured_jaw_speed_beyond_its_maximum_extends_the_lead_no_further() -
     last[N_ARM] += 0.5
     lead = (clip(desired, ZERO, last, MIDDLE, moving).q - MIDDLE)[N_ARM]
     max_lead = 3.0 / KP[N_ARM] + DQ_MAX[N_ARM] * LIMITS.gripper_lag_s
-    assert lead == pytest.approx(max(max_lead, 0.5 - DQ_MAX[N_ARM] * CONTROL_PERIOD_S))
+    assert lead == pytest.approx(max(max_lead, 0.5 - SPEED_TOLERANCE * DQ_MAX[N_ARM] * CONTROL_PERIOD_S))
 
 
 def test_an_arm_outside_its_limits_returns_at_no_more_than_the_joints_speed() -> None:
     outside = Q_MAX + 0.1
     allowed = clip(outside, ZERO, outside, outside)
-    assert allowed.q[:N_ARM] == pytest.approx((outside - DQ_MAX * CONTROL_PERIOD_S)[:N_ARM])
+    assert allowed.q[:N_ARM] == pytest.approx((outside - SPEED_TOLERANCE * DQ_MAX * CONTROL_PERIOD_S)[:N_ARM])
+
+
+@pytest.mark.parametrize("offset", [-0.0003, 0.0])
+def test_a_joint_that_rests_on_or_just_beyond_its_limit_stays_there_and_is_not_clipped(offset: float) -> None:
+    q = MIDDLE.copy()
+    q[1] = Q_MIN[1] + offset
+    allowed = clip_setpoint(LIMITS, q, ZERO, q_command=q, q_last=q, q_measured=q, dq_measured=ZERO)
+    assert allowed.q == pytest.approx(q, abs=1e-12)
+    assert not allowed.clipped
+    further = q - 0.001
+    allowed = clip_setpoint(LIMITS, further, ZERO, q_command=q, q_last=q, q_measured=q, dq_measured=ZERO)
+    assert allowed.q[1] == pytest.approx(q[1], abs=1e-12)
+    assert allowed.clipped
+
+
+def test_brakes_too_weak_for_full_speed_are_rejected() -> None:
+    with raises(InvalidMessageError, "invalid_limit"):
+        ServoLimits(brake_ddq_max=2.0 * DDQ_MAX)
 
 
 def test_a_joint_that_does_not_follow_is_named() -> None:

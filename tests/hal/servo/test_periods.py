@@ -47,6 +47,29 @@ def test_a_summary_is_cached_for_a_second() -> None:
     assert periods.summary().max_ms == pytest.approx(982.0)
 
 
+class FilledMeanwhile(PeriodStatistics):
+    """Statistics into which the tick records a period whenever their reader looks."""
+
+    @property
+    def _filled(self) -> int:
+        self.count += 1
+        return self.count
+
+    @_filled.setter
+    def _filled(self, value: int) -> None:
+        self.count = value
+
+    count = 0
+
+
+def test_a_period_recorded_while_the_percentiles_are_computed_does_no_harm() -> None:
+    periods = FilledMeanwhile()
+    periods._ring_s[:] = 0.002
+    for reading in range(1, 40):
+        periods.count, periods.ticks = reading, 1000 * reading
+        assert periods.summary().p50_ms == pytest.approx(2.0)
+
+
 def test_the_time_between_two_ticking_threads_is_no_period() -> None:
     periods = PeriodStatistics()
     for start_s in (0.0, 7.0):

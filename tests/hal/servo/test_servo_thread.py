@@ -77,7 +77,32 @@ def test_a_servo_on_the_wall_clock_plays_a_trajectory_and_measures_its_periods()
     assert 0 < status.period_ms_p50 <= status.period_ms_p999
 
 
-def test_an_error_in_a_tick_latches_the_stop_and_is_raised_when_the_thread_is_stopped(
+def test_an_error_in_one_tick_latches_the_stop_and_the_ticks_go_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = WallClock()
+    servo = Servo(MockArm(clock, q=START), clock)
+    servo.connect()
+    servo.claim("test")
+    servo.stream(move(duration_s=1.0))
+    with ServoThread(servo, clock):
+        while servo.status().trajectory_time_s < 0.2:
+            clock.sleep_until(clock.now_s() + 0.005)
+        run, errors = servo._cycle.run, [ZeroDivisionError("a defect")]
+        monkeypatch.setattr(servo._cycle, "run", lambda now_s: fail_once(errors) or run(now_s))
+        while servo.status().mode is not ServoMode.STOPPED:
+            clock.sleep_until(clock.now_s() + 0.005)
+        ticks = servo.status().ticks
+        while servo.status().ticks < ticks + 10:
+            clock.sleep_until(clock.now_s() + 0.005)
+    assert "the servo's tick failed: ZeroDivisionError: a defect" in servo.status().reason
+    assert 0.0 < servo.status().q_command[0] - START[0] < STEP[0]
+
+
+def fail_once(errors: list[Exception]) -> None:
+    if errors:
+        raise errors.pop()
+
+
+def test_an_error_in_every_tick_latches_the_stop_and_is_raised_when_the_thread_is_stopped(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     clock = WallClock()

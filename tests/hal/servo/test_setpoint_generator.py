@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
@@ -18,8 +20,8 @@ LIMITS = ServoLimits()
 class Driver:
     """A generator whose commands pass unclipped, with all of them recorded."""
 
-    def __init__(self) -> None:
-        self.generator = SetpointGenerator(LIMITS, START)
+    def __init__(self, find_violation: Callable[[np.ndarray], str] = lambda _: "") -> None:
+        self.generator = SetpointGenerator(LIMITS, START, find_violation)
         self.q = [START]
 
     def apply(self, command: JointCommand) -> None:
@@ -48,45 +50,74 @@ def test_it_holds_its_initial_position() -> None:
 
 def test_a_trajectory_is_played_to_its_end_and_held() -> None:
     driver, trajectory = Driver(), start_buffer(move(), LIMITS)
-    driver.generator.begin(trajectory)
+    driver.generator.begin(trajectory, START)
     driver.play(trajectory, 1.002)
     assert driver.generator.finished
     assert driver.generator.mode is ServoMode.HOLDING
     assert driver.q[-1] == pytest.approx(START + STEP)
 
 
-def test_an_incomplete_buffer_has_an_underrun_at_its_end_only() -> None:
-    driver, trajectory = Driver(), start_buffer(move(until_s=0.1), LIMITS)
-    driver.generator.begin(trajectory)
-    driver.play(trajectory, 0.1)
-    assert not driver.generator.has_underrun(trajectory)
-    driver.play(trajectory, CONTROL_PERIOD_S)
-    assert driver.generator.has_underrun(trajectory)
+def test_an_incomplete_buffer_has_an_underrun_while_a_stop_still_ends_on_it() -> None:
+    driver, trajectory = Driver(), start_buffer(move(until_s=0.4), LIMITS)
+    driver.generator.begin(trajectory, START)
+    while not driver.generator.has_underrun(trajectory):
+        driver.apply(driver.generator.play(trajectory))
+    assert 0.25 < driver.generator.trajectory_time_s < 0.4
+    driver.generator.brake("test")
+    driver.rest()
+    progress = (driver.q[-1] - START) / STEP
+    assert np.ptp(progress) < 1e-6
+    assert progress[0] <= (trajectory.q[-1, 0] - START[0]) / STEP[0] + 1e-9
 
 
-@pytest.mark.parametrize("on_path", [True, False])
-def test_braking_starts_at_the_last_command_and_ends_at_rest(on_path: bool) -> None:
+def test_braking_starts_at_the_last_command_and_ends_at_rest_on_the_path() -> None:
     driver, trajectory = Driver(), start_buffer(move(), LIMITS)
-    driver.generator.begin(trajectory)
+    driver.generator.begin(trajectory, START)
     driver.play(trajectory, 0.5)
-    driver.generator.brake("test", trajectory if on_path else None)
+    driver.generator.brake("test")
     assert (driver.generator.mode, driver.generator.reason) == (ServoMode.BRAKING, "test")
     driver.rest()
     assert driver.generator.mode is ServoMode.HOLDING
     assert driver.max_acceleration() < 2.0 * LIMITS.ddq_max.max()
-    # Off the path each joint stops for itself; on it all joints have made the same part of the step.
-    progress = ((driver.q[-1] - START) / STEP)[:N_ARM]
-    assert (np.ptp(progress) < 1e-6) == on_path
+    assert np.ptp((driver.q[-1] - START) / STEP) < 1e-6, "all joints have made the same part of the step"
 
 
-def test_the_predicted_rest_position_is_where_braking_ends() -> None:
-    driver = Driver()
-    for _ in range(100):
+def test_a_step_is_only_taken_while_the_stop_from_it_is_allowed() -> None:
+    """A wall in joint 1 that appears in the middle of the motion: the arm stops before it, as was known before."""
+    wall = START[0] + 0.3
+
+    def find_violation(q: np.ndarray) -> str:
+        return "meets the wall" if (q[:, 0] > wall).any() else ""
+
+    driver = Driver(find_violation)
+    while driver.generator.mode is not ServoMode.BRAKING:
         driver.apply(driver.generator.track(START + STEP))
-    predicted = driver.generator.predict_rest_position()
-    driver.generator.brake("test")
+    assert "the motion to the setpoint meets the wall" in driver.generator.reason
     driver.rest()
-    assert driver.q[-1] == pytest.approx(predicted, abs=1e-9)
+    q = np.array(driver.q)
+    assert wall - 0.05 < q[-1, 0] <= wall
+    jerk = np.abs(np.diff(q, n=3, axis=0)) / CONTROL_PERIOD_S**3
+    assert (jerk <= 1.01 * LIMITS.brake_dddq_max).all()
+
+
+def test_a_trajectory_that_starts_elsewhere_is_begun_by_a_motion_to_its_start() -> None:
+    driver, trajectory = Driver(), start_buffer(move(start=START + 0.04), LIMITS)
+    driver.generator.begin(trajectory, START)
+    driver.play(trajectory, 2.0)
+    assert driver.generator.finished
+    assert driver.q[-1] == pytest.approx(START + 0.04 + STEP)
+    assert driver.max_acceleration() <= 1.05 * LIMITS.ddq_max.max()
+
+
+def test_a_squeezing_gripper_begins_where_it_is() -> None:
+    driver = Driver()
+    squeezed = START.copy()
+    squeezed[N_ARM] -= 0.3
+    trajectory = start_buffer(move(start=squeezed), LIMITS)
+    driver.generator.begin(trajectory, squeezed)
+    command = driver.generator.play(trajectory)
+    assert command.q == pytest.approx(squeezed)
+    assert driver.generator.trajectory_time_s == 0.0
 
 
 def test_yielding_moves_the_hold_to_the_measured_arm_and_keeps_the_grip() -> None:
