@@ -24,6 +24,9 @@ from hal.servo.trajectory_buffer import TrajectoryBuffer, extend_buffer, start_b
 _CHECK_EVERY_S = 0.01
 """Time between two postures that the guard checks [s]: at full speed a joint turns 0.03 rad in it."""
 
+_MAX_ID_STEP = 1_000_000
+"""Maximum distance between the numbers of two trajectories: one huge number would leave none for the next client."""
+
 
 class Snapshot(NamedTuple):
     """The result of a tick for all other threads; replaced as a whole."""
@@ -109,8 +112,10 @@ class CommandMailbox:
             self.played_id = trajectory.trajectory_id
 
     def claim(self, owner: str, now_s: float, *, at_rest: bool) -> None:
-        """Claim the lease (errors as `Lease.claim`)."""
+        """Claim the lease (errors as `Lease.claim`); while the stop is latched, also from another client."""
         with self._lock:
+            if self.latch:
+                self.lease.clear()
             self.lease.claim(owner, now_s, at_rest=at_rest)
 
     def release(self, owner: str | None) -> None:
@@ -131,9 +136,11 @@ class CommandMailbox:
             self.latch = self.latch or reason
             self._cancel(reason)
 
-    def rearm(self) -> None:
-        """Clear a latched stop and free the lease."""
+    def rearm(self, owner: str | None, now_s: float) -> None:
+        """Clear a latched stop and free the lease; `owner` (None = the operator) must own it, as for a command."""
         with self._lock:
+            if owner is not None:
+                self.lease.renew(owner, now_s)
             if self.latch:
                 self._drop()  # a command may have been accepted while the tick found a fault
                 self.latch = ""
@@ -154,6 +161,12 @@ class CommandMailbox:
                     f"servo: trajectory {chunk.trajectory_id} is over ({snapshot.reason or 'played or replaced'}). "
                     f"Start a new one, number {newest + 1} or above.",
                     code="stale_trajectory",
+                )
+            if chunk.trajectory_id > newest + _MAX_ID_STEP:
+                raise CommandRejectedError(
+                    f"servo: trajectory {chunk.trajectory_id} is far from the last one (allowed {newest + 1} to "
+                    f"{newest + _MAX_ID_STEP}). Number trajectories from the status's.",
+                    code="invalid_trajectory_id",
                 )
             self._check_start(chunk, snapshot)
             new = start_buffer(chunk, self._limits)
