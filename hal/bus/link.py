@@ -9,7 +9,7 @@ from contextlib import suppress
 import zenoh
 
 from hal.base.clock import Clock
-from hal.base.errors import HalError, HalTimeoutError, NotConnectedError
+from hal.base.errors import HalError, HalTimeoutError, LeaseError, NotConnectedError
 from hal.bus import keys
 from hal.bus.authentication import NO_SECRET, LeaseGrant, Request, open_answer, verify_code
 from hal.bus.codec import Hello, decode
@@ -47,6 +47,7 @@ class BusLink:
         self._queriers: dict[str, tuple[zenoh.Querier, threading.Lock]] = {}
         self._lock = threading.Lock()  # two threads may make a request of one key at once
         self._counter = itertools.count(1)
+        self._greeted = False
         before = existing_segments() if shared_memory else set()
         self.session = open_session(config, listen=False, shared_memory=shared_memory)
         # This session's own segments, which Zenoh would leave behind
@@ -54,6 +55,7 @@ class BusLink:
         try:
             self.secret = link_secret(config)
             self.hello, self.clock_offset_s = self._handshake()
+            self._greeted = True
         except HalError:
             self.close()
             raise
@@ -97,6 +99,12 @@ class BusLink:
         # No reply at once: no service exists. No reply after the timeout: the other end of Zenoh gave up first.
         if self._clock.now_s() - sent_s > 0.5 * self._config.request_timeout_s:
             raise self._no_answer(key)
+        if self._config.keys and self._greeted:
+            raise LeaseError(
+                f"bus: no answer to {key}: the role of the certificate in {self._config.keys} does not allow it, or "
+                f"the HAL has ended. Use an operator's keys.",
+                code="no_permission",
+            )
         raise no_answer_error(self._config)
 
     def is_signed(self, key: str, content: zenoh.ZBytes | bytes, code: zenoh.ZBytes | bytes | None) -> bool:

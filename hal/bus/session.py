@@ -21,7 +21,7 @@ _LOG = logging.getLogger(__name__)
 _MAX_COMMAND_BYTES = 8 * 2**20
 """Maximum message to the HAL process; the longest chunk (`hal.servo.trajectory_buffer.MAX_POINTS`) has 1.2 MB."""
 _MIN_SHARED_BYTES = 4 * 2**20
-"""Space in /dev/shm below which Zenoh gets no shared memory: it would abort the process on its first segments of 1 MiB."""
+"""Space in /dev/shm below which Zenoh gets no shared memory: it would abort the process on its first segments."""
 # Silent connections are closed after 0.5 s, twenty times an honest handshake on a loaded machine, and 300 of them
 # still leave room for a client. Zenoh's own limits are 10 s and 100.
 _ACCEPTING = {"accept_timeout": 500, "accept_pending": 400, "max_sessions": 32}

@@ -1,12 +1,13 @@
 """The stop without a session: a Unix datagram socket of the HAL, which no network connection can block.
 
-A datagram `stop REASON` latches the stop, `status` only asks; both are answered by one line, `MODE<tab>REASON<tab>OWNER`
+A datagram `stop REASON` latches the stop, `status` only asks; the answer is one line, `MODE<tab>REASON<tab>OWNER`
 or `error TEXT`. The socket's file is open to the HAL's user alone. The client's part imports nothing of size.
 """
 
 from __future__ import annotations
 
 import logging
+import os
 import socket
 from collections.abc import Callable
 from contextlib import suppress
@@ -102,16 +103,18 @@ class StopClient:
     """
 
     def __init__(self, robot: str, port: int, timeout_s: float = 1.0) -> None:
-        path = find_file(stop_socket_name(robot, port))
+        path, self._own_path = find_file(stop_socket_name(robot, port)), None
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         try:
             if path is None:
                 raise FileNotFoundError(stop_socket_name(robot, port))
             self._socket.settimeout(timeout_s)
-            self._socket.bind("")  # Linux then gives it an address, to which the answer goes
+            # The answer goes to a file too: an abstract address would not reach from a container's network.
+            self._own_path = path.with_name(f"answer-{os.urandom(6).hex()}")
+            self._socket.bind(str(self._own_path))
             self._socket.connect(str(path))
         except OSError as err:  # no file, or one of a HAL that was killed
-            self._socket.close()
+            self.close()
             raise HalTimeoutError(f"stop: no HAL of this user serves {robot!r} at port {port}.", code="no_hal") from err
 
     def stop(self, reason: str) -> StopAnswer:
@@ -143,3 +146,5 @@ class StopClient:
     def close(self) -> None:
         """Close the connection."""
         self._socket.close()
+        if self._own_path is not None:
+            self._own_path.unlink(missing_ok=True)
