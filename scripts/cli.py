@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import difflib
 import os
 import sys
 import traceback
 from importlib import import_module
-from importlib.metadata import version
 
 from hal.base.errors import UsageError, Z1Error
 
@@ -35,6 +33,7 @@ COMMANDS = {
     ),
     "stop": ("scripts.commands.stop_arm", "stop the arm now; the stop latches until rearm"),
     "rearm": ("scripts.commands.rearm_arm", "lift the latched stop, after inspecting the arm"),
+    "keys": ("scripts.commands.manage_keys", "make the keys of a link beyond this machine: certificates with roles"),
     "doctor": ("scripts.commands.doctor", "check this machine, and show the fix of each failed check"),
     "show-config": ("scripts.commands.show_config", "print every setting in force and its origin"),
     "docs": ("scripts.commands.serve_docs", "serve the documentation"),
@@ -59,6 +58,8 @@ def main(argv: list[str] | None = None) -> int:
         print(_usage())
         return 0 if name else BAD_USAGE
     if name in ("-V", "--version"):
+        from importlib.metadata import version  # 50 ms, which `stop` must not wait for
+
         print(f"z1-grasp {version('z1-grasp')}")
         return 0
     if name not in COMMANDS:
@@ -97,6 +98,8 @@ def _run(name: str, arguments: list[str]) -> int:
 
 
 def _unknown(name: str) -> str:
+    import difflib
+
     near = difflib.get_close_matches(name, COMMANDS, n=1)
     guess = f" Did you mean `{near[0]}`?" if near else ""
     return f"there is no command {name!r}.{guess} Known: {', '.join(COMMANDS)}."

@@ -11,14 +11,16 @@ import numpy as np
 
 from hal.base.clock import WallClock
 from hal.base.errors import HalTimeoutError
-from hal.bus.link import BusLink
+from hal.bus import keys
+from hal.bus.authentication import Request
+from hal.bus.link import BusLink, link_secret
 from hal.bus.service import Service
 from hal.bus.session import BusConfig, open_session
 
 if TYPE_CHECKING:
     from sim_twin.model.world import SceneView
 
-_KEY = "eval/ground_truth"
+_KEY = f"{keys.EVALUATION}/ground_truth"
 _POSES = ("T_base_object", "T_flange_camera", "T_base_board")
 
 
@@ -61,7 +63,8 @@ class GroundTruthServer:
     def __init__(self, config: BusConfig, world: SceneView) -> None:
         self._world = world
         self._session = open_session(config, listen=False)
-        self._service = Service(self._session, _KEY, self._answer, on_failure=lambda: None)
+        secret = link_secret(config)
+        self._service = Service(self._session, _KEY, self._answer, on_failure=lambda: None, secret=secret)
         atexit.register(self.close)  # a program that ends carelessly leaves no thread inside Zenoh
 
     def close(self) -> None:
@@ -70,7 +73,7 @@ class GroundTruthServer:
         self._service.close()
         self._session.close()
 
-    def _answer(self, client: str, payload: bytes) -> bytes:
+    def _answer(self, request: Request) -> bytes:
         ground_truth = read_ground_truth(self._world)
         content = {
             "object": ground_truth.object,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import tempfile
 
 import pytest
 from hypothesis import settings
@@ -18,6 +19,10 @@ settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci"))
 
 # Calibration results of this machine must not change a test.
 os.environ["Z1_CALIBRATIONS"] = "/nonexistent/calibrations"
+
+# Secrets and sockets of the tests' HALs are kept out of this user's; a short path, which a socket needs.
+_RUNTIME_FOLDER = tempfile.TemporaryDirectory(prefix="z1-test-")
+os.environ["XDG_RUNTIME_DIR"] = _RUNTIME_FOLDER.name
 
 _OFF_BY_DEFAULT = ("hardware", "slow")
 

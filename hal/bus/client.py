@@ -5,7 +5,6 @@ from __future__ import annotations
 import atexit
 import logging
 import threading
-import uuid
 from types import TracebackType
 from typing import Self
 
@@ -13,11 +12,13 @@ import zenoh
 
 from hal.base.background_loop import BackgroundLoop
 from hal.base.clock import Clock, WallClock
-from hal.base.errors import HalTimeoutError, NotConnectedError
+from hal.base.errors import HalError, HalTimeoutError, InvalidMessageError, NotConnectedError
 from hal.base.messages import ArmSetpoint, ArmState, ServoStatus, TrajectoryChunk
 from hal.bus import keys
+from hal.bus.authentication import LeaseGrant
 from hal.bus.codec import decode, encode
 from hal.bus.link import BusLink
+from hal.bus.rate_limit import LimitedLog
 from hal.bus.remote_camera import RemoteCamera as RemoteCamera  # noqa: PLC0414 (a re-export)
 from hal.bus.service import Listener, as_bytes
 from hal.bus.session import BusConfig
@@ -33,20 +34,20 @@ class RemoteArm:
 
     Args:
         config: address of the HAL process.
-        owner: name of this client; a random suffix distinguishes two of the same name.
+        owner: name of this client; the HAL adds a suffix, which distinguishes two of the same name.
         clock: the wall clock.
     """
 
     def __init__(self, config: BusConfig | None = None, owner: str = "runtime", clock: Clock | None = None) -> None:
         self._config = config or BusConfig()
-        self._suffix = uuid.uuid4().hex[:8]
-        self._owner = f"{owner}-{self._suffix}"
+        self._name = owner
         self._clock = clock or WallClock()
         self._link: BusLink | None = None
         self._states: Listener | None = None
-        self._newest = b""  # encoded: only a state that is read gets decoded
+        self._newest: ArmState | None = None
         self._arrived = threading.Event()
         self._heartbeat: _HeartbeatSender | None = None
+        self._dropped = LimitedLog(_LOG)
 
     # --- Connection -----------------------------------------------------------------------------------------------
 
@@ -55,12 +56,14 @@ class RemoteArm:
 
         Raises:
             HalTimeoutError: no HAL process answers, or it publishes no state.
+            HalError: a program answers that is not a HAL of this user (`unverified_hal`).
         """
         if self._link is not None:
             return
         link = BusLink(self._config, self._clock, "the remote arm")
         self._arrived.clear()
-        states = Listener(link.session, keys.STATE, self._on_state)
+        self._newest = None
+        states = Listener(link.session, keys.STATE, lambda sample: self._on_state(link, sample))
         if not self._arrived.wait(self._config.connect_timeout_s):
             states.close()
             link.close()
@@ -80,8 +83,8 @@ class RemoteArm:
         try:
             if self._heartbeat is not None:
                 self.release()
-        except HalTimeoutError:
-            pass  # the HAL process is gone; without the heartbeat the lease would lapse anyway
+        except HalError:
+            pass  # the HAL process is gone, or has another owner; without the heartbeat the lease would lapse anyway
         finally:
             self._stop_heartbeat()
             self._link = self._states = None
@@ -117,7 +120,7 @@ class RemoteArm:
 
     def send(self, setpoint: ArmSetpoint) -> ArmSetpoint:
         """Send one setpoint (see `hal.base.arm.Arm.send`)."""
-        return decode(self._connected().request(keys.SEND, encode(setpoint), self._owner_name()), ArmSetpoint)
+        return decode(self._command(keys.SEND, encode(setpoint)), ArmSetpoint)
 
     def stop(self, reason: str = "") -> None:
         """Brake, hold, and latch, whichever client owns the lease; returns when the servo has accepted it.
@@ -125,7 +128,7 @@ class RemoteArm:
         Raises:
             HalTimeoutError: no answer: use the switch on the arm.
         """
-        self._connected().request(keys.STOP, reason.encode(), self._owner_name())
+        self._command(keys.STOP, reason.encode())
 
     # --- Servo ----------------------------------------------------------------------------------------------------
 
@@ -135,26 +138,24 @@ class RemoteArm:
         Args:
             owner: name for this lease; default is the one of the constructor.
         """
-        link = self._connected()
-        name = f"{owner}-{self._suffix}" if owner else self._owner
-        link.request(keys.CLAIM, owner=name)
-        if self._heartbeat is None or self._heartbeat.owner != name:
+        link, name, present = self._connected(), owner or self._name, self._heartbeat
+        again = present is not None and present.name == name
+        grant = decode(link.request(keys.CLAIM, present.grant.prove() if present and again else b"", name), LeaseGrant)
+        if present is None or present.grant != grant:
             self._stop_heartbeat()
-            self._heartbeat = _HeartbeatSender(link.session, name, 1.0 / self._config.heartbeat_rate_hz)
+            self._heartbeat = _HeartbeatSender(link, name, grant, 1.0 / self._config.heartbeat_rate_hz)
             self._heartbeat.start()
 
     def release(self) -> None:
         """Release the lease (see `hal.base.arm.ServoedArm.release`)."""
-        link = self._connected()
-        name = self._owner_name()
         try:
-            link.request(keys.RELEASE, owner=name)
+            self._command(keys.RELEASE)
         finally:
             self._stop_heartbeat()
 
     def stream(self, chunk: TrajectoryChunk) -> None:
         """Queue a trajectory chunk; returns when the servo has accepted it (see `hal.base.arm.ServoedArm.stream`)."""
-        self._connected().request(keys.CHUNK, encode(chunk), self._owner_name())
+        self._command(keys.CHUNK, encode(chunk))
 
     def status(self) -> ServoStatus:
         """Request the servo's present status.
@@ -164,16 +165,25 @@ class RemoteArm:
         return decode(self._connected().request(keys.READ_STATUS), ServoStatus)
 
     def rearm(self) -> None:
-        """Clear a latched stop (see `hal.base.arm.ServoedArm.rearm`)."""
-        self._connected().request(keys.REARM, owner=self._owner_name())  # this frees the lease
-        self._stop_heartbeat()
+        """Clear a latched stop (see `hal.base.arm.ServoedArm.rearm`).
+
+        Raises:
+            LeaseError: nothing is stopped, and another client owns the lease.
+        """
+        owned_before = self._heartbeat is not None
+        self.claim(self._heartbeat.name if self._heartbeat else "")  # succeeds while the stop is latched
+        status = decode(self._command(keys.REARM), ServoStatus)
+        if not status.owner:
+            self._stop_heartbeat()
+        elif not owned_before:
+            self.release()
 
     # --- Inside ---------------------------------------------------------------------------------------------------
 
     def _newest_state(self) -> tuple[ArmState, float]:
         """Return the newest measurement received, and its age [s]."""
-        link = self._connected()
-        state = decode(self._newest, ArmState)
+        link, state = self._connected(), self._newest
+        assert state is not None  # `connect` has waited for the first
         return state, self._clock.now_s() + link.clock_offset_s - state.stamp_s
 
     def _connected(self) -> BusLink:
@@ -181,11 +191,25 @@ class RemoteArm:
             raise NotConnectedError("the remote arm")
         return self._link
 
-    def _owner_name(self) -> str:
-        return self._heartbeat.owner if self._heartbeat is not None else self._owner
+    def _command(self, key: str, payload: bytes = b"") -> bytes:
+        """Return the answer to a command, signed by the lease's secret when this client owns it."""
+        present = self._heartbeat
+        if present is None:
+            return self._connected().request(key, payload, self._name)
+        return self._connected().request(key, payload, present.grant.owner, present.grant)
 
-    def _on_state(self, sample: zenoh.Sample) -> None:
-        self._newest = as_bytes(sample.payload)
+    def _on_state(self, link: BusLink, sample: zenoh.Sample) -> None:
+        if not link.is_signed(keys.STATE, sample.payload, sample.attachment):
+            self._dropped.warning("bus: an arm state was dropped: the HAL did not sign it.")
+            return
+        try:
+            state = decode(as_bytes(sample.payload), ArmState)
+        except InvalidMessageError as error:
+            self._dropped.warning("bus: an arm state was dropped: %s", error)
+            return
+        newest = self._newest
+        if newest is None or state.stamp_s > newest.stamp_s:  # a state sent again is older
+            self._newest = state
         self._arrived.set()
 
     def _stop_heartbeat(self) -> None:
@@ -195,13 +219,16 @@ class RemoteArm:
 
 
 class _HeartbeatSender(BackgroundLoop):
-    """A thread that publishes `owner` on the heartbeat key every `period_s` [s]."""
+    """A thread that publishes the heartbeat of the lease `grant` every `period_s` [s]."""
 
-    def __init__(self, session: zenoh.Session, owner: str, period_s: float) -> None:
+    def __init__(self, link: BusLink, name: str, grant: LeaseGrant, period_s: float) -> None:
         super().__init__("bus heartbeat")
-        self.owner = owner
+        self.name = name
+        """Name under which the lease was claimed."""
+        self.grant = grant
+        self._link = link
         self._period_s = period_s
-        self._publisher = session.declare_publisher(
+        self._publisher = link.session.declare_publisher(
             keys.HEARTBEAT,
             priority=zenoh.Priority.REAL_TIME,
             congestion_control=zenoh.CongestionControl.DROP,  # a late heartbeat is worth no more than the next one
@@ -209,10 +236,9 @@ class _HeartbeatSender(BackgroundLoop):
         )
 
     def _run(self) -> None:
-        payload = self.owner.encode()
         try:
             while not self._stop_requested.wait(self._period_s):
-                self._publisher.put(payload)
+                self._publisher.put(b"", attachment=self._link.sign_heartbeat(self.grant))
             self._publisher.undeclare()
         except zenoh.ZError as err:  # the session was closed, as at the end of the process
             _LOG.debug("the heartbeat ends: %s", err)

@@ -20,6 +20,7 @@ import numpy as np
 
 import hal.base.messages
 from hal.base.errors import InvalidMessageError
+from hal.bus.authentication import LeaseGrant
 
 VERSION = 1
 MAX_BYTES = 64 * 2**20
@@ -47,7 +48,7 @@ class Hello:
 
 MESSAGES: dict[str, type] = {
     name: kind for name, kind in inspect.getmembers(hal.base.messages, inspect.isclass) if is_dataclass(kind)
-} | {"Hello": Hello}
+} | {"Hello": Hello, "LeaseGrant": LeaseGrant}
 
 
 @cache

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import queue
 
+import zenoh
+
 from hal.base.clock import Clock
 from hal.base.errors import HalTimeoutError
 from hal.base.messages import ServoHealth
@@ -23,7 +25,12 @@ def wait_for_health(config: BusConfig, clock: Clock, timeout_s: float = 3.0) -> 
     """
     messages: queue.SimpleQueue[bytes] = queue.SimpleQueue()
     link = BusLink(config, clock, "the HAL's health")
-    listener = Listener(link.session, keys.HEALTH, lambda sample: messages.put(as_bytes(sample.payload)))
+
+    def receive(sample: zenoh.Sample) -> None:
+        if link.is_signed(keys.HEALTH, sample.payload, sample.attachment):
+            messages.put(as_bytes(sample.payload))
+
+    listener = Listener(link.session, keys.HEALTH, receive)
     try:
         return decode(messages.get(timeout=timeout_s), ServoHealth)
     except queue.Empty as err:

@@ -16,9 +16,11 @@ from hal.base.clock import Clock, WallClock
 from hal.base.errors import HalTimeoutError, InvalidMessageError, NotConnectedError
 from hal.base.messages import Intrinsics, RgbdFrame
 from hal.bus import keys
+from hal.bus.authentication import CODE_BYTES
 from hal.bus.codec import decode
 from hal.bus.frames import FrameStamp
 from hal.bus.link import BusLink
+from hal.bus.rate_limit import LimitedLog
 from hal.bus.service import Listener, as_bytes
 from hal.bus.session import BusConfig
 
@@ -44,6 +46,7 @@ class RemoteCamera:
         self._clock = clock or WallClock()
         self._link: BusLink | None = None
         self._intrinsics: Intrinsics | None = None
+        self._dropped = LimitedLog(_LOG)
         self._changed = threading.Condition()
         # Below, all under `_changed`.
         self._listener: Listener | None = None
@@ -65,7 +68,7 @@ class RemoteCamera:
         if self._link is not None:
             return
         self.lost_frames = 0
-        self._link = BusLink(self._config, self._clock, "the remote camera")
+        self._link = BusLink(self._config, self._clock, "the remote camera", shared_memory=self._config.shared_memory)
         atexit.register(self.disconnect)  # a program that ends without it must leave no thread inside Zenoh
         try:
             # At least 1 s: before the first frame the camera may have to start its stream.
@@ -175,11 +178,12 @@ class RemoteCamera:
         return decode(data, RgbdFrame)
 
     def _on_frame(self, sample: zenoh.Sample) -> None:
-        try:
-            stamp = FrameStamp.unpack(as_bytes(sample.attachment))
-        except InvalidMessageError as error:
-            _LOG.warning("bus: a frame was dropped: %s", error)
+        attachment, link = as_bytes(sample.attachment), self._link
+        packed, code = attachment[:-CODE_BYTES], attachment[-CODE_BYTES:]
+        if link is None or not link.is_signed(keys.FRAME, packed, code):
+            self._dropped.warning("bus: a frame was dropped: the HAL did not sign it.")
             return
+        stamp = FrameStamp.unpack(packed)
         with self._changed:
             if self._listener is None:  # disconnected
                 return

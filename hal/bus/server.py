@@ -4,11 +4,11 @@ Messages, directions and quality of service:
 
 * State and status: put at 100 Hz, REAL_TIME, DROP, express. The newest replaces the one before.
 * Health: put once a second.
-* Heartbeat: put by the owner at 50 Hz, the same. One may be lost; seven in a row make the servo brake.
+* Heartbeat: put by the owner at 50 Hz, the same, signed. One may be lost; seven in a row make the servo brake.
 * Trajectory chunks: acked queries, not puts. A lost chunk would show only as a buffer underrun, and a rejected one not
   at all; an answer costs about 1 ms every 0.1 s.
 * Stop, re-arm, claim, release, send, status: acked queries, each on a thread of its own, so that a stop waits for no
-  other. Stop and re-arm need no lease: every client may stop the arm.
+  other. The stop needs no lease: every client may stop the arm, also on a Unix socket (`hal.bus.stop_socket`).
 * Frames: put, DATA_LOW, DROP, in shared memory, only while a client listens.
 """
 
@@ -28,13 +28,17 @@ from hal.base.clock import Clock
 from hal.base.errors import HalError, InvalidMessageError, LeaseError
 from hal.base.messages import ArmSetpoint, ServoHealth, TrajectoryChunk
 from hal.bus import keys
+from hal.bus.authentication import NO_SECRET, LeaseAuthority, Request, compute_code
 from hal.bus.codec import VERSION, Hello, decode, decode_text, encode
 from hal.bus.frames import FrameBuffers, FrameStamp, existing_segments, mapped_segments, unlink_segments
+from hal.bus.rate_limit import LimitedLog, StateChangeWarning
+from hal.bus.runtime_files import make_secret
 from hal.bus.service import Listener, RequestHandler, Service, ServiceThread, as_bytes
-from hal.bus.session import BusConfig, open_session
+from hal.bus.session import BusConfig, has_shared_memory, open_session
+from hal.bus.stop_socket import StopAnswer, StopSocket
 
 _LOG = logging.getLogger(__name__)
-_ANONYMOUS = "anonymous"  # owner of a message without a name; clients always have one, with a suffix
+_ANONYMOUS = "an anonymous client"
 _FRAME_TIMEOUT_S = 1.0
 _RETRY_S = 0.2  # pause after a camera error, so that a camera that fails at once does not occupy a core
 _HEALTH_PERIOD_S = 1.0
@@ -53,6 +57,8 @@ class OwnedServo(ServoedArm, Protocol):
     def send(self, setpoint: ArmSetpoint, owner: str | None = None) -> ArmSetpoint: ...
 
     def stop(self, reason: str = ...) -> None: ...
+
+    def rearm(self, owner: str | None = None) -> None: ...
 
     def health(self) -> ServoHealth: ...
 
@@ -78,19 +84,24 @@ class HalServer:
         self._closing = Event()
         self.failed = Event()
         """Set when an error ended a thread of the server; the process should then stop the arm and end."""
-        self._buffers = FrameBuffers(camera.intrinsics, shared=config.shared_memory)
+        # Before the session: a client that can connect finds the secret.
+        self._secret = NO_SECRET if config.keys else make_secret(config.port)
+        shared = config.shared_memory and has_shared_memory()
         before = existing_segments()
-        try:
-            self._session = open_session(config, listen=True)
-        except HalError:
-            self._buffers.close()
-            raise
+        self._session = open_session(config, listen=True, shared_memory=shared)
         self._segments = mapped_segments() - before
+        try:
+            self._stop_socket = StopSocket(config.robot, config.port, servo.stop, self._read_stop_answer)
+        except HalError:
+            self._session.close()
+            raise
+        self._buffers = FrameBuffers(camera.intrinsics, shared=shared)
+        self._authority = LeaseAuthority()
+        self._unreadable_reasons = LimitedLog(_LOG)
         self._threads: list[ServiceThread] = []
-        self._heartbeat_warning = _StateChangeWarning("heartbeat rejected")
         self._start_publishing()
         self._services = [
-            Service(self._session, key, handle, self.failed.set, allow_anonymous=key == keys.STOP)
+            Service(self._session, key, handle, self.failed.set, self._secret, allow_anonymous=key == keys.STOP)
             for key, handle in self._request_handlers()
         ]
 
@@ -105,6 +116,7 @@ class HalServer:
         if self._closing.is_set():
             return
         self._closing.set()
+        self._stop_socket.close()
         for service in self._services:
             service.close()
         self._heartbeats.close()
@@ -150,12 +162,12 @@ class HalServer:
 
     def _publish_state(self) -> None:
         period_s = 1.0 / self._config.state_rate_hz
-        warning = _StateChangeWarning("arm state not published")
+        warning = StateChangeWarning(_LOG, "arm state not published")
         due_s = self._clock.now_s()
         while not self._closing.is_set():
-            self._status.put(encode(self._servo.status()))  # first: it is needed most when the arm is silent
+            self._put(self._status, keys.STATUS, encode(self._servo.status()))  # first: for an arm that is silent
             try:
-                self._state.put(encode(self._servo.read_state()))
+                self._put(self._state, keys.STATE, encode(self._servo.read_state()))
                 warning.clear()
             except HalError as error:
                 warning.warn(error)
@@ -165,7 +177,10 @@ class HalServer:
 
     def _publish_health(self) -> None:
         while not self._closing.wait(_HEALTH_PERIOD_S):
-            self._health.put(encode(self._servo.health()))
+            self._put(self._health, keys.HEALTH, encode(self._servo.health()))
+
+    def _put(self, publisher: zenoh.Publisher, key: str, payload: bytes) -> None:
+        publisher.put(payload, attachment=compute_code(self._secret, key, payload))
 
     def _while_listened(self) -> Iterator[None]:
         """Yield repeatedly while a client listens to frames; wait while none does; end at `close()`."""
@@ -182,7 +197,7 @@ class HalServer:
                 yield
 
     def _publish_frames(self) -> None:
-        warning = _StateChangeWarning("frames not published")
+        warning = StateChangeWarning(_LOG, "frames not published")
         for _ in self._while_listened():
             try:
                 frame = self._camera.wait_for_frame(_FRAME_TIMEOUT_S)
@@ -193,46 +208,62 @@ class HalServer:
                 continue
             warning.clear()
             stamp = FrameStamp(sent_s=self._clock.now_s(), exposed_s=frame.stamp_s, sequence=frame.sequence)
-            self._frames.put(payload, attachment=stamp.pack())
+            packed = stamp.pack()  # signed alone: a code over megabytes would cost milliseconds a frame
+            self._frames.put(payload, attachment=packed + compute_code(self._secret, keys.FRAME, packed))
 
     # --- Commands -------------------------------------------------------------------------------------------------
 
     def _on_heartbeat(self, sample: zenoh.Sample) -> None:
         try:
-            self._servo.heartbeat(decode_text(as_bytes(sample.payload), "the heartbeat") or _ANONYMOUS)
-            self._heartbeat_warning.clear()
-        except LeaseError:
+            request = Request.unpack(keys.HEARTBEAT, b"", as_bytes(sample.attachment))
+            self._servo.heartbeat(self._authority.owner_of(request))
+        except (LeaseError, InvalidMessageError):
             pass  # a client that has just lost the lease gets the error of its next command
-        except HalError as error:
-            self._heartbeat_warning.warn(error)
+
+    def _check_user(self, request: Request) -> None:
+        if not request.is_signed_by(self._secret):
+            raise LeaseError(
+                f"bus: {request.name or _ANONYMOUS!r} did not sign {request.key} with this link's secret. Run client "
+                f"and HAL as the same user, or both with `--keys`.",
+                code="unverified_client",
+            )
+
+    def _read_stop_answer(self) -> StopAnswer:
+        status = self._servo.status()
+        return StopAnswer(status.mode.value, status.reason, status.owner)
 
     def _request_handlers(self) -> list[tuple[str, RequestHandler]]:
-        servo = self._servo
+        servo, owner_of = self._servo, self._authority.owner_of
 
-        def claim(owner: str, _: bytes) -> bytes:
-            servo.claim(owner)
+        def claim(request: Request) -> bytes:
+            self._check_user(request)
+            self._authority.check_claim(request)
+            grant = self._authority.grant_for(request)
+            servo.claim(grant.owner)
+            self._authority.put_in_force(grant)  # after the servo: a rejected claim changes nothing
+            return encode(grant)
+
+        def release(request: Request) -> bytes:
+            servo.release(owner_of(request))
             return b""
 
-        def release(owner: str, _: bytes) -> bytes:
-            servo.release(owner or _ANONYMOUS)
+        def stream(request: Request) -> bytes:
+            servo.stream(decode(request.payload, TrajectoryChunk), owner=owner_of(request))
             return b""
 
-        def stream(owner: str, data: bytes) -> bytes:
-            servo.stream(decode(data, TrajectoryChunk), owner=owner)
+        def send(request: Request) -> bytes:
+            return encode(servo.send(decode(request.payload, ArmSetpoint), owner=owner_of(request)))
+
+        def stop(request: Request) -> bytes:
+            servo.stop(self._decode_reason(request.payload) or f"stop requested by {request.name or _ANONYMOUS}")
             return b""
 
-        def send(owner: str, data: bytes) -> bytes:
-            return encode(servo.send(decode(data, ArmSetpoint), owner=owner))
+        def rearm(request: Request) -> bytes:
+            servo.rearm(owner_of(request))
+            return encode(servo.status())
 
-        def stop(owner: str, data: bytes) -> bytes:
-            servo.stop(_decode_reason(data) or f"stop requested by {owner or _ANONYMOUS}")
-            return b""
-
-        def rearm(_: str, __: bytes) -> bytes:
-            servo.rearm()
-            return b""
-
-        def status(_: str, __: bytes) -> bytes:
+        def status(request: Request) -> bytes:
+            self._check_user(request)
             return encode(servo.status())
 
         return [
@@ -246,36 +277,16 @@ class HalServer:
             (keys.HELLO, self._hello),  # last: a client that gets its answer finds all other services running
         ]
 
-    def _hello(self, _: str, __: bytes) -> bytes:
+    def _hello(self, request: Request) -> bytes:
+        self._check_user(request)
         versions = [f"{name}={version(name)}" for name in ("z1-grasp", "eclipse-zenoh")]
         hello = Hello(robot=self._config.robot, versions=(f"protocol={VERSION}", *versions), now_s=self._clock.now_s())
         return encode(hello)
 
-
-def _decode_reason(reason: bytes) -> str:
-    # A stop is executed whatever its payload.
-    try:
-        return decode_text(reason, "the reason")
-    except InvalidMessageError as error:
-        _LOG.warning("a stop has an unreadable reason: %s", error)
-        return ""
-
-
-class _StateChangeWarning:
-    """A warning logged when a failure begins and when it is over, not at every cycle in between."""
-
-    def __init__(self, failure: str) -> None:
-        self._failure = failure
-        self._kind: tuple[type[HalError], str] | None = None
-
-    def warn(self, error: HalError) -> None:
-        """Log `error`, unless the last one was of the same class and code (texts hold stamps and ages)."""
-        if self._kind != (kind := (type(error), error.code)):
-            self._kind = kind
-            _LOG.warning("%s: %s", self._failure, error)
-
-    def clear(self) -> None:
-        """Log the end of the failure, if there was one."""
-        if self._kind is not None:
-            self._kind = None
-            _LOG.info("over: %s", self._failure)
+    def _decode_reason(self, reason: bytes) -> str:
+        # A stop is executed whatever its payload.
+        try:
+            return decode_text(reason, "the reason")
+        except InvalidMessageError as error:
+            self._unreadable_reasons.warning("a stop has an unreadable reason: %s", error)
+            return ""

@@ -8,21 +8,28 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator
-from threading import Thread, current_thread
+from threading import Event, Thread, current_thread
 from typing import Any
 
 import zenoh
 
+from hal.base.clock import WallClock
 from hal.base.errors import HalError, InvalidMessageError
-from hal.bus.codec import decode_text
+from hal.bus.authentication import Request, sign_answer
 from hal.bus.error_codec import encode_error
+from hal.bus.rate_limit import LimitedLog, TokenBucket
 
 _LOG = logging.getLogger(__name__)
 _WAITING = 32
 """Maximum number of queries that wait for one service; beyond it the oldest are dropped, and their clients time out."""
+_RATE_HZ, _BURST = 1000.0, 100.0
+"""Messages that one service or topic takes a second: twice the fastest client's. A flood beyond it is left in the
+ring, so that it cannot take the interpreter from the servo."""
+_REJECTED_COST = 10.0
+"""Messages for which a rejected one counts: no honest client sends more than a few."""
 
-RequestHandler = Callable[[str, bytes], bytes]
-"""Takes the requester's name and the payload, returns the answer's payload; a `HalError` travels back as itself."""
+RequestHandler = Callable[[Request], bytes]
+"""Returns the answer's payload; a `HalError` travels back as itself."""
 
 
 def receive_items(handler: Any) -> Iterator[Any]:
@@ -78,21 +85,22 @@ class Listener:
         on_failure: Callable[[], None] = lambda: None,
     ) -> None:
         self._on_sample = on_sample
-        self._closing = False
+        self._closing = Event()
+        self._bucket = TokenBucket(_RATE_HZ, _BURST, WallClock())
         self._subscriber = session.declare_subscriber(key, zenoh.handlers.RingChannel(waiting))
         self._thread = ServiceThread(f"bus {key}", self._run, on_failure)
         self._thread.start()
 
     def close(self) -> None:
         """Stop listening; waits for the sample in progress, except when called by `on_sample` itself."""
-        self._closing = True
+        self._closing.set()
         self._subscriber.undeclare()
         if self._thread is not current_thread():
             self._thread.join()
 
     def _run(self) -> None:
         for sample in receive_items(self._subscriber.handler):
-            if self._closing:  # samples that were still waiting
+            if self._closing.wait(self._bucket.take()):  # samples that were still waiting
                 return
             self._on_sample(sample)
 
@@ -105,7 +113,8 @@ class Service:
         key: key expression of the queries.
         handle: answers a query.
         on_failure: called when an unexpected error ends the thread.
-        allow_anonymous: also serve a query whose requester's name is unreadable (the stop).
+        secret: the link's, which signs the answers (`hal.bus.link.link_secret`).
+        allow_anonymous: also serve a query whose attachment is unreadable (the stop).
     """
 
     def __init__(
@@ -114,12 +123,17 @@ class Service:
         key: str,
         handle: RequestHandler,
         on_failure: Callable[[], None],
+        secret: bytes,
         *,
         allow_anonymous: bool = False,
     ) -> None:
         self._key = key
         self._handle = handle
+        self._secret = secret
         self._allow_anonymous = allow_anonymous
+        self._closing = Event()
+        self._bucket = TokenBucket(_RATE_HZ, _BURST, WallClock())
+        self._rejections = LimitedLog(_LOG)
         # A ring, not a FIFO: a full FIFO would block the thread that receives for the whole session.
         self._queryable = session.declare_queryable(key, zenoh.handlers.RingChannel(_WAITING))
         self._thread = ServiceThread(f"bus {key}", self._run, on_failure)
@@ -127,32 +141,49 @@ class Service:
 
     def close(self) -> None:
         """Stop answering; waits for the answer in progress."""
+        self._closing.set()
         self._queryable.undeclare()
         self._thread.join()
 
     def _run(self) -> None:
         for query in receive_items(self._queryable.handler):
             with query:
+                if self._closing.wait(self._bucket.take()):
+                    return
                 self._serve(query)
 
     def _serve(self, query: zenoh.Query) -> None:
         try:
-            reply = self._handle(self._requester(query), as_bytes(query.payload))
-        except HalError as error:
-            if isinstance(error, InvalidMessageError):
-                _LOG.warning("%s: rejected a malformed request: %s", self._key, error)
-            rejection = encode_error(error)
-            self._send(lambda: query.reply_err(rejection))
-        else:
-            self._send(lambda: query.reply(self._key, reply, express=True))
-
-    def _requester(self, query: zenoh.Query) -> str:
+            request = self._unpack(query)
+        except InvalidMessageError as error:
+            self._reject(query, Request(key=self._key, payload=b""), error)
+            return
         try:
-            return decode_text(as_bytes(query.attachment), "the requester's name")
+            answer = self._handle(request)
+        except HalError as error:
+            self._reject(query, request, error)
+        except Exception as error:  # every type: the error of one request is not the end of its service
+            _LOG.exception("%s: a request failed", self._key)
+            self._reject(query, request, HalError(f"bus: {self._key} failed: {error}. See its log.", code="internal"))
+        else:
+            signed = sign_answer(self._secret, request, "answer", answer)
+            self._send(lambda: query.reply(self._key, signed, express=True))
+
+    def _unpack(self, query: zenoh.Query) -> Request:
+        payload = as_bytes(query.payload)
+        try:
+            return Request.unpack(self._key, payload, as_bytes(query.attachment))
         except InvalidMessageError:
             if self._allow_anonymous:
-                return ""
+                return Request(key=self._key, payload=payload)
             raise
+
+    def _reject(self, query: zenoh.Query, request: Request, error: HalError) -> None:
+        self._bucket.take(_REJECTED_COST)
+        if isinstance(error, InvalidMessageError):
+            self._rejections.warning("%s: rejected a malformed request: %s", self._key, error)
+        signed = sign_answer(self._secret, request, "error", encode_error(error))
+        self._send(lambda: query.reply_err(signed))
 
     def _send(self, reply: Callable[[], None]) -> None:
         try:
@@ -161,6 +192,6 @@ class Service:
             _LOG.debug("%s: the answer was not sent: %s", self._key, err)
 
 
-def as_bytes(payload: zenoh.ZBytes | None) -> bytes:
+def as_bytes(payload: zenoh.ZBytes | bytes | None) -> bytes:
     """Return a payload or attachment as bytes; empty when there is none."""
-    return b"" if payload is None else payload.to_bytes()
+    return payload.to_bytes() if isinstance(payload, zenoh.ZBytes) else payload or b""

@@ -1,21 +1,30 @@
-"""Opening the Zenoh link: no discovery, one endpoint, loopback by default."""
+"""Opening the Zenoh link: no discovery, one endpoint, loopback by default; beyond it only with TLS and roles."""
 
 from __future__ import annotations
 
 import ipaddress
 import json
 import logging
+import os
 import re
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import zenoh
 
-from hal.base.errors import HalError, HalTimeoutError, InvalidValueError
+from hal.base.errors import HalError, HalTimeoutError, InvalidValueError, MissingFileError
+from hal.bus.access_control import ROLES, access_control, heartbeat_limit
 from hal.bus.codec import MAX_BYTES
 
 _LOG = logging.getLogger(__name__)
 _MAX_COMMAND_BYTES = 8 * 2**20
 """Maximum message to the HAL process; the longest chunk (`hal.servo.trajectory_buffer.MAX_POINTS`) has 1.2 MB."""
+_MIN_SHARED_BYTES = 4 * 2**20
+"""Space in /dev/shm below which Zenoh gets no shared memory: it would abort the process on its first segments."""
+# Silent connections are closed after 0.5 s, twenty times an honest handshake on a loaded machine, and 300 of them
+# still leave room for a client. Zenoh's own limits are 10 s and 100.
+_ACCEPTING = {"accept_timeout": 500, "accept_pending": 400, "max_sessions": 32}
 _ROBOT = re.compile(r"[A-Za-z0-9_-]{1,40}")  # no character with a meaning in Zenoh's key expressions
 
 
@@ -26,7 +35,7 @@ class BusConfig:
     robot: str = "z1"
     """Name of the robot: the Zenoh namespace (letters, digits, `-`, `_`)."""
     host: str = "127.0.0.1"
-    """Address the HAL process listens on; the link is neither encrypted nor authenticated, so keep it on loopback."""
+    """Address the HAL process listens on; off loopback the link needs `keys`."""
     port: int = 7447
     """Its TCP port."""
     connect_timeout_s: float = 2.0
@@ -41,6 +50,8 @@ class BusConfig:
     """Rate of the lease owner's heartbeat [Hz]; the servo brakes after 0.15 s without one."""
     shared_memory: bool = True
     """True sends frames through shared memory where both ends can."""
+    keys: str = ""
+    """Folder with this party's certificate (`./z1 keys`): the link is then encrypted, and each client has a role."""
 
     def __post_init__(self) -> None:
         if not _ROBOT.fullmatch(self.robot):
@@ -59,7 +70,7 @@ class BusConfig:
     def endpoint(self) -> str:
         """The Zenoh endpoint."""
         host = f"[{self.host}]" if ":" in self.host else self.host
-        return f"tcp/{host}:{self.port}"
+        return f"{'tls' if self.keys else 'tcp'}/{host}:{self.port}"
 
     @property
     def is_loopback(self) -> bool:
@@ -72,17 +83,89 @@ class BusConfig:
             return False
 
 
-def open_session(config: BusConfig, *, listen: bool) -> zenoh.Session:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Certificates:
+    """Files of one party in a TLS link, as `./z1 keys` writes them."""
+
+    authority: Path
+    """Certificate of the robot's authority."""
+    certificate: Path
+    private_key: Path
+    clients: Path
+    """In the HAL's folder: role of each client's common name, in JSON."""
+
+    @staticmethod
+    def find(folder: str) -> Certificates:
+        """Return the files in `folder`.
+
+        Raises:
+            MissingFileError: one is missing (`no_certificates`).
+            InvalidValueError: other users can read the private key (`exposed_key`).
+        """
+        root = Path(folder)
+        files = Certificates(
+            authority=root / "authority.pem",
+            certificate=root / "certificate.pem",
+            private_key=root / "private.key",
+            clients=root / "clients.json",
+        )
+        for path in (files.authority, files.certificate, files.private_key):
+            if not path.is_file():
+                raise MissingFileError(
+                    f"bus: {path} is missing. Make the keys with `./z1 keys make`, and name this party's folder with "
+                    f"`--keys`.",
+                    code="no_certificates",
+                )
+        if files.private_key.stat().st_mode & 0o077:
+            raise InvalidValueError(
+                f"bus: other users can read {files.private_key}. Close it with `chmod 600`.", code="exposed_key"
+            )
+        return files
+
+    def read_clients(self) -> tuple[str, dict[str, str]]:
+        """Return the HAL's own common name, and the role of each client's.
+
+        Raises:
+            InvalidValueError: the file is missing or unreadable (`invalid_clients`): no client would be safe to serve.
+        """
+        try:
+            content = json.loads(self.clients.read_text())
+            own, clients = content["hal"], content["clients"]
+            if not (isinstance(own, str) and all(isinstance(n, str) and clients[n] in ROLES for n in clients)):
+                raise ValueError(f"roles must be of {', '.join(ROLES)}")
+        except (OSError, ValueError, KeyError, TypeError, AttributeError) as err:
+            raise InvalidValueError(
+                f"bus: {self.clients} does not list the clients and their roles ({err}). `--keys` of a HAL names the "
+                f"folder `hal` that `./z1 keys make` writes.",
+                code="invalid_clients",
+            ) from err
+        return own, clients
+
+
+def open_session(config: BusConfig, *, listen: bool, shared_memory: bool = False) -> zenoh.Session:
     """Return an open session: the HAL process listens, clients connect.
 
+    Args:
+        config: address, and the keys of a TLS link.
+        listen: True for the HAL process.
+        shared_memory: whether frames may come or go through shared memory.
+
     Raises:
-        HalError: the port is taken (`port_taken`), or the address is not of this machine (`invalid_address`).
+        HalError: the port is taken (`port_taken`), or the address is not of this machine or TLS or the roles cannot be
+            set up (`cannot_listen`).
         HalTimeoutError: no HAL process listens there (`no_hal`).
+        InvalidValueError: the address is off loopback, and there are no keys (`open_network`).
+        UsageError, MissingFileError: the keys cannot be used.
     """
-    if listen and not config.is_loopback:
-        _LOG.warning("any program that reaches %s can command the arm: the link is not encrypted.", config.endpoint)
+    if not config.is_loopback and not config.keys:
+        raise InvalidValueError(
+            f"bus: {config.host} is not a loopback address, and the link is not encrypted (allowed: 127.0.0.1, or any "
+            f"address with keys). Make keys with `./z1 keys make`, and name this party's folder with `--keys`.",
+            code="open_network",
+        )
+    settings = zenoh_settings(config, listen=listen, shared_memory=shared_memory and has_shared_memory())
     try:
-        return zenoh.open(_zenoh_config(config, listen=listen))
+        return zenoh.open(zenoh.Config.from_json5(json.dumps(settings)))
     except zenoh.ZError as err:
         if not listen:
             raise no_answer_error(config) from err
@@ -93,8 +176,9 @@ def open_session(config: BusConfig, *, listen: bool) -> zenoh.Session:
                 code="port_taken",
             ) from err
         raise HalError(
-            f"bus: cannot listen on {config.endpoint} ({err}). Choose an address of this machine.",
-            code="invalid_address",
+            f"bus: cannot listen on {config.endpoint} ({err}). Choose an address of this machine, and check the keys "
+            f"when there are some.",
+            code="cannot_listen",
         ) from err
 
 
@@ -107,10 +191,31 @@ def no_answer_error(config: BusConfig) -> HalTimeoutError:
     )
 
 
-def _zenoh_config(config: BusConfig, *, listen: bool) -> zenoh.Config:
+def has_shared_memory() -> bool:
+    """Return True when /dev/shm has room for Zenoh's segments, with a warning when it has not."""
+    try:
+        space = os.statvfs("/dev/shm")
+    except OSError:
+        return False
+    enough = space.f_bavail * space.f_frsize >= _MIN_SHARED_BYTES
+    if not enough:
+        _LOG.warning("/dev/shm is full or very small: frames go as bytes over the link, a few milliseconds slower.")
+    return enough
+
+
+def zenoh_settings(config: BusConfig, *, listen: bool, shared_memory: bool) -> dict[str, Any]:
+    """Return Zenoh's settings of a session (errors as `open_session`)."""
     ends = {"endpoints": [config.endpoint], "exit_on_failure": True}
     none = {"endpoints": []}
-    settings = {
+    # By default Zenoh would gather a message of up to 1 GiB from any sender.
+    link: dict[str, Any] = {"rx": {"max_message_size": _MAX_COMMAND_BYTES if listen else MAX_BYTES}}
+    own_name, clients = "", None
+    if config.keys:
+        files = Certificates.find(config.keys)
+        link |= {"protocols": ["tls"], "tls": _tls_settings(files)}
+        if listen:
+            own_name, clients = files.read_clients()
+    settings: dict[str, Any] = {
         "mode": "peer" if listen else "client",
         "namespace": config.robot,
         "listen": ends if listen else none,
@@ -118,10 +223,10 @@ def _zenoh_config(config: BusConfig, *, listen: bool) -> zenoh.Config:
         # Explicit endpoints only: discovery would also find the HAL processes of other robots.
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
         "transport": {
-            # By default Zenoh would gather a message of up to 1 GiB from any sender.
-            "link": {"rx": {"max_message_size": _MAX_COMMAND_BYTES if listen else MAX_BYTES}},
+            "unicast": _ACCEPTING if listen else {},
+            "link": link,
             "shared_memory": {
-                "enabled": config.shared_memory,
+                "enabled": shared_memory,
                 # Frames are placed in shared memory by hand (hal/bus/frames.py). Zenoh's own pool would also take
                 # queries, where restarts of the client leave segments behind.
                 "mode": "lazy",
@@ -129,4 +234,21 @@ def _zenoh_config(config: BusConfig, *, listen: bool) -> zenoh.Config:
             },
         },
     }
-    return zenoh.Config.from_json5(json.dumps(settings))
+    if listen:
+        settings["access_control"] = access_control(config.robot, clients, own_name)
+        settings["downsampling"] = heartbeat_limit(config.robot)
+    return settings
+
+
+def _tls_settings(files: Certificates) -> dict[str, Any]:
+    key, certificate = str(files.private_key), str(files.certificate)
+    return {
+        "root_ca_certificate": str(files.authority),
+        "enable_mtls": True,
+        "verify_name_on_connect": True,
+        "close_link_on_expiration": True,
+        "listen_private_key": key,
+        "listen_certificate": certificate,
+        "connect_private_key": key,
+        "connect_certificate": certificate,
+    }

@@ -118,8 +118,10 @@ class CommandMailbox:
             self.played_id = trajectory.trajectory_id
 
     def claim(self, owner: str, now_s: float, *, at_rest: bool) -> None:
-        """Claim the lease (errors as `Lease.claim`)."""
+        """Claim the lease (errors as `Lease.claim`); while the stop is latched, also from another client."""
         with self._lock:
+            if self.latch:
+                self.lease.clear()
             self.lease.claim(owner, now_s, at_rest=at_rest)
 
     def release(self, owner: str | None) -> None:
@@ -141,10 +143,15 @@ class CommandMailbox:
             self.cancel_reason = reason
             self.latch = reason
 
-    def rearm(self) -> None:
-        """Clear a latched stop and free the lease; a stop that arrives meanwhile stays."""
+    def rearm(self, owner: str | None, now_s: float) -> None:
+        """Clear a latched stop and free the lease; a stop that arrives meanwhile stays.
+
+        `owner` (None = the operator) must own the lease, as for a command.
+        """
         with self._lock:
             before = self._latest_stop
+            if owner is not None:
+                self.lease.renew(owner, now_s)
             if self.latch:
                 self._drop()  # a command may have been accepted while the tick found a fault
                 self.latch = ""

@@ -172,10 +172,17 @@ class Servo:
             self._snapshot = snapshot._replace(mode=ServoMode.STOPPED, reason=reason)
             self.arm.stop()
 
-    def rearm(self) -> None:
-        """Clear a latched stop; the arm holds its position and the lease is free. No effect when not stopped."""
+    def rearm(self, owner: str | None = None) -> None:
+        """Clear a latched stop; the arm holds its position and the lease is free. No effect when not stopped.
+
+        Args:
+            owner: client that rearms; None = the operator, in this process.
+
+        Raises:
+            LeaseError: `owner` does not own the lease; while the stop is latched it can claim it.
+        """
         self._connected()
-        self._mailbox.rearm()
+        self._mailbox.rearm(owner, self.clock.now_s())
 
     def stream(self, chunk: TrajectoryChunk, owner: str | None = None) -> None:
         """Queue a trajectory chunk (see `hal.base.arm.ServoedArm.stream`).

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import os
+import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
+from hal.base.clock import WallClock
 from hal.base.errors import HalError, HalTimeoutError, InvalidValueError
 from hal.bus.client import RemoteArm, RemoteCamera
+from hal.bus.link import BusLink
 from hal.bus.session import BusConfig, open_session
 from tests.support.errors import raises
-from tests.support.hal.bus_hal import free_config
+from tests.support.hal.bus_hal import ROOT, free_config, wait_until
 
 pytestmark = pytest.mark.integration
 
@@ -79,3 +84,58 @@ def test_the_session_listens_on_its_loopback_endpoint_and_scouts_nowhere():
         listening = [row[1] for row in _own_sockets("tcp") + _own_sockets("tcp6") if row[3] == "0A"]
         assert listening == [f"0100007F:{config.port:04X}"]
         assert [row[1] for row in _own_sockets("udp") + _own_sockets("udp6")] == before
+
+
+def _open_files() -> list[str]:
+    names = []
+    for descriptor in Path("/proc/self/fd").iterdir():
+        try:
+            names.append(os.readlink(descriptor))
+        except FileNotFoundError:  # the one of the listing itself
+            continue
+    return sorted(names)
+
+
+@pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="reads Linux's descriptor tables")
+@pytest.mark.parametrize("shared_memory", [False, True])
+def test_a_closed_link_leaves_no_descriptor_open(hal, shared_memory):
+    def connect() -> None:
+        BusLink(hal.config, WallClock(), "a client", shared_memory=shared_memory).close()
+
+    connect()
+    before = len(_open_files())
+    for _ in range(5):
+        connect()
+    wait_until(lambda: len(_open_files()) <= before)
+
+
+FRAMES_WITHOUT_ROOM = """
+import logging, sys
+from threading import Event
+from hal.backends.mock_arm import make_rig
+from hal.bus.client import RemoteCamera
+from hal.bus.session import BusConfig
+from hal.process import serve
+logging.basicConfig(level=logging.WARNING)
+config, end = BusConfig(port=int(sys.argv[1]), connect_timeout_s=10.0), Event()
+
+def watch():
+    with RemoteCamera(config) as camera:
+        print(camera.wait_for_frame(5.0).sequence >= 0, camera.shared_memory)
+    end.set()
+
+serve(make_rig(), config, end, on_ready=watch)
+"""
+
+
+@pytest.mark.skipif(shutil.which("unshare") is None, reason="makes a mount namespace")
+@pytest.mark.parametrize("size", ["64k", "1m", "3m"])
+def test_a_small_shm_folder_leaves_a_link_that_sends_bytes(size):
+    mount = f"mount -t tmpfs -o size={size} tmpfs /dev/shm || exit 77"
+    command = ["unshare", "--user", "--map-root-user", "--mount", "sh", "-c", f'{mount}; exec "$@"', "sh"]
+    program = [sys.executable, "-c", FRAMES_WITHOUT_ROOM, str(free_config().port)]
+    run = subprocess.run([*command, *program], cwd=ROOT, capture_output=True, text=True, check=False, timeout=60)
+    if run.returncode == 77 or "unshare" in run.stderr:
+        pytest.skip("mounting in a namespace of its own is not permitted")
+    assert (run.stdout, run.returncode) == ("True False\n", 0), run.stderr
+    assert "/dev/shm" in run.stderr
