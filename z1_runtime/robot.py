@@ -13,14 +13,15 @@ import numpy as np
 
 from hal.base import z1
 from hal.base.clock import Clock
-from hal.base.errors import GuardError, InvalidValueError
-from hal.base.messages import ArmState, RgbdFrame
+from hal.base.errors import GuardError, InvalidValueError, StoppedError
+from hal.base.messages import ArmState, RgbdFrame, ServoMode
 from hal.rig import RIGS, Devices, connect_remote, connect_rig
 from z1_runtime.config import RuntimeConfig
 from z1_runtime.motion.executor import Executor
 from z1_runtime.motion.limits import MotionLimits
 from z1_runtime.motion.trajectory import joint_move
 from z1_runtime.perception.extrinsics import Extrinsics, find_extrinsics
+from z1_runtime.tasks.holding import check_empty, check_release
 from z1_runtime.visualization.rerun_logger import RerunLogger
 
 if TYPE_CHECKING:  # detector, generator and planner take seconds to load, and only a pick needs them
@@ -177,14 +178,16 @@ class Robot:
 
     # --- Motion ---------------------------------------------------------------------------------------------------
 
-    def move_to(self, goal: np.ndarray, *, jaw: float | None = None) -> ArmState:
+    def move_to(self, goal: np.ndarray, *, jaw: float | None = None, drop: bool = False) -> ArmState:
         """Move straight in joint space to `goal`; return the state at rest there.
 
         Args:
             goal: arm joints (6,) or all joints (7,) [rad], or a pose T_base_pivot (4, 4) of the gripper's pivot.
             jaw: jaw angle at the goal [rad]; None = as `goal` has it, else unchanged.
+            drop: open the jaws also when they hold an object.
 
         Raises:
+            GripperLoadedError: the jaws hold an object, the goal is more open, and `drop` is False; nothing moves.
             InvalidValueError: `goal` is outside the joint limits or of another shape; nothing moves.
             IkFailure: no joints inside the limits reach the pose; nothing moves.
             GuardError: the motion meets table, arm or the workspace's border; nothing moves.
@@ -193,7 +196,10 @@ class Robot:
         """
         self.arm.claim(self._owner)
         q_start = np.clip(self.arm.status().q_command, z1.Q_MIN, z1.Q_MAX)
-        motion = joint_move(q_start, self._goal_joints(goal, q_start, jaw), MotionLimits.at_speed(self.config.speed))
+        q_goal = self._goal_joints(goal, q_start, jaw)
+        if not drop:
+            check_release(self.state(), float(q_start[z1.N_ARM]), float(q_goal[z1.N_ARM]), self.config, "move")
+        motion = joint_move(q_start, q_goal, MotionLimits.at_speed(self.config.speed))
         if violation := self._guard.find_violation(motion.q, q_start):
             raise GuardError(
                 f"robot: the motion is not allowed ({100 * violation.index / len(motion.q):.0f} % along it, "
@@ -203,9 +209,9 @@ class Robot:
         self._executor.execute(motion)
         return self._executor.settle()
 
-    def home(self, *, jaw: float | None = None) -> ArmState:
+    def home(self, *, jaw: float | None = None, drop: bool = False) -> ArmState:
         """Move to the observation posture (see `move_to`); without `jaw` a held object stays held."""
-        return self.move_to(z1.Q_HOME, jaw=jaw)
+        return self.move_to(z1.Q_HOME, jaw=jaw, drop=drop)
 
     def stop(self) -> None:
         """Brake, hold, and latch; every command is rejected until `rearm`."""
@@ -221,14 +227,34 @@ class Robot:
         """Load detector, generator and planner, and run them once, so that the first pick does not wait for them."""
         self._load_selector(self.config)
 
-    def pick(self, object_class: str | None = None, *, attempts: int | None = None) -> PickResult:
+    def check_ready(self, *, drop: bool = False) -> None:
+        """Check that a pick may begin, before anything slow is loaded for it.
+
+        Args:
+            drop: allow jaws that hold an object.
+
+        Raises:
+            StoppedError: the stop is latched.
+            GripperLoadedError: the jaws hold an object and `drop` is False.
+        """
+        status = self.arm.status()
+        if status.mode is ServoMode.STOPPED:
+            raise StoppedError(status.reason)
+        if not drop:
+            check_empty(self.state(), self.config, "pick")
+
+    def pick(
+        self, object_class: str | None = None, *, attempts: int | None = None, drop: bool = False
+    ) -> PickResult:
         """Pick an object from the home posture, and hold it up.
 
         Args:
             object_class: class of the object, for a detector that knows classes; None = the configuration's.
             attempts: number of picks until the jaws hold an object; None = the configuration's.
+            drop: open the jaws also when they hold an object at the start.
 
         Raises:
+            StoppedError, GripperLoadedError: see `check_ready`; nothing moves.
             InvalidValueError: the detector does not know the class.
             PerceptionError: no usable object is visible.
             NoPlanError: no candidate is feasible.
@@ -236,6 +262,7 @@ class Robot:
         """
         from z1_runtime.tasks.pick import PickTask
 
+        self.check_ready(drop=drop)
         config = replace(
             self.config,
             object_class=self.config.object_class if object_class is None else object_class,
@@ -252,7 +279,7 @@ class Robot:
             config=config,
             on_phase=self._on_phase,
         )
-        return task.pick_until_held()
+        return task.pick_until_held(drop=drop)
 
     # --- Life -----------------------------------------------------------------------------------------------------
 

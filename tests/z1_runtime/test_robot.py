@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 import numpy as np
@@ -30,6 +30,7 @@ from z1_runtime import Robot
 from z1_runtime.config import RuntimeConfig
 from z1_runtime.geometry.kinematics import IkFailure, Kinematics
 from z1_runtime.perception.detectors.ground_truth import GroundTruthDetector
+from z1_runtime.tasks.holding import GripperLoadedError
 
 
 def lockstep_rig() -> Rig:
@@ -73,6 +74,58 @@ def test_home_is_the_observation_posture_and_keeps_the_jaw(robot: Robot) -> None
     robot.move_to(z1.Q_HOME + 0.1, jaw=-0.2)
     np.testing.assert_allclose(robot.home().q, np.append(z1.Q_HOME, -0.2), atol=1e-3)
     np.testing.assert_allclose(robot.home(jaw=-1.0).q, np.append(z1.Q_HOME, -1.0), atol=1e-3)
+
+
+@pytest.fixture
+def loaded(robot: Robot) -> Robot:
+    """The robot with an object in its jaws, at 0.5 rad."""
+    robot.move_to(z1.Q_HOME, jaw=-0.5)
+    mock_of(robot).block(z1.N_ARM)
+    robot.move_to(z1.Q_HOME, jaw=0.0)
+    return robot
+
+
+def mock_of(robot: Robot) -> MockArm:
+    servo = robot.arm
+    assert isinstance(servo, Servo) and isinstance(servo.arm, MockArm)
+    return servo.arm
+
+
+@pytest.mark.parametrize(
+    "open_jaws",
+    [
+        lambda robot: robot.home(jaw=-1.0),
+        lambda robot: robot.move_to(z1.Q_HOME + 0.1, jaw=-0.6),
+        lambda robot: robot.move_to(robot.state().q),
+        lambda robot: robot.pick(),
+    ],
+    ids=["home", "move_to", "the measured joints", "pick"],
+)
+def test_jaws_that_hold_an_object_are_not_opened(loaded: Robot, open_jaws: Callable[[Robot], object]) -> None:
+    before = loaded.arm.status()
+    with raises(GripperLoadedError, "gripper_loaded") as caught:
+        open_jaws(loaded)
+    assert "29°" in str(caught.value) and "Nm" in str(caught.value)
+    assert loaded.arm.status().trajectory_id == before.trajectory_id
+
+
+def test_jaws_that_hold_an_object_carry_it_and_open_on_request(loaded: Robot) -> None:
+    assert loaded.move_to(z1.Q_HOME + 0.05).q[z1.N_ARM] == pytest.approx(-0.5, abs=1e-3)
+    mock_of(loaded).block(None)
+    assert loaded.home(jaw=-1.0, drop=True).q[z1.N_ARM] == pytest.approx(-1.0, abs=1e-3)
+
+
+def test_jaws_closed_on_nothing_open(robot: Robot) -> None:
+    robot.move_to(z1.Q_HOME, jaw=0.0)
+    assert robot.home(jaw=-1.0).q[z1.N_ARM] == pytest.approx(-1.0, abs=1e-3)
+
+
+def test_a_stopped_robot_rejects_a_pick_before_it_loads_the_planner(robot: Robot, monkeypatch) -> None:
+    monkeypatch.setattr(robot, "_load_selector", lambda _: pytest.fail("loaded"))
+    robot.stop()
+    robot.clock.sleep_until(robot.clock.now_s() + 0.01)
+    with raises(StoppedError, "stopped"):
+        robot.pick()
 
 
 def unreachable_pose() -> np.ndarray:

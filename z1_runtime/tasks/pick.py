@@ -21,6 +21,7 @@ from z1_runtime.motion.trajectory import MotionLimits, hold, joint_move
 from z1_runtime.perception.detector import PerceptionError
 from z1_runtime.planning.planner import NoPlanError
 from z1_runtime.tasks.grasp_selection import GraspSelection, GraspSelector
+from z1_runtime.tasks.holding import check_empty, is_holding
 from z1_runtime.types import GraspPlan
 from z1_runtime.visualization.rerun_logger import RerunLogger
 
@@ -112,12 +113,18 @@ class PickTask:
         self._motion = MotionLimits.at_speed(config.speed)
         self._phases: list[Phase] = []
 
-    def pick(self) -> PickResult:
+    def pick(self, *, drop: bool = False) -> PickResult:
         """Capture a frame, select a grasp, and execute it.
 
+        Args:
+            drop: open the jaws also when they hold an object.
+
         Raises:
+            GripperLoadedError: the jaws hold an object and `drop` is False; nothing moves.
             As `GraspSelector.select`; and `MotionError`, `HalError` when the arm does not follow.
         """
+        if not drop:
+            check_empty(self.arm.read_state(), self.config, "pick")
         self._phases.clear()
         with self._phase("home"):
             self._go_home()
@@ -131,23 +138,25 @@ class PickTask:
         state = self._execute(selection.plan)
         jaw, torque = float(state.q[-1]), float(state.tau[-1])
         return PickResult(
-            # Negative is open: an object keeps the jaws from closing
-            held=jaw < self.config.jaw_empty and abs(torque) > self.config.held_torque_nm,
+            held=is_holding(state, self.config),
             selection=selection,
             phases=tuple(self._phases),
             jaw=jaw,
             jaw_torque_nm=torque,
         )
 
-    def pick_until_held(self) -> PickResult:
+    def pick_until_held(self, *, drop: bool = False) -> PickResult:
         """Pick, and while the jaws hold nothing pick again from the scene as it then is, `attempts` times in all.
 
         Returns the last pick that was executed: an object pushed out of view or out of reach ends the attempts too.
 
+        Args:
+            drop: open the jaws also when they hold an object at the start.
+
         Raises:
             As `pick`, for the first attempt; for later ones only errors of the arm or the HAL.
         """
-        result = self.pick()
+        result = self.pick(drop=drop)
         for attempt in range(2, self.config.attempts + 1):
             if result.held:
                 break

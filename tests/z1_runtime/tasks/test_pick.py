@@ -20,6 +20,7 @@ from z1_runtime.factory import draw_can, make_grasp_selector
 from z1_runtime.motion.executor import MotionError
 from z1_runtime.perception.detector import NoDepthError, NoDetectionError
 from z1_runtime.tasks.grasp_selection import GraspSelector
+from z1_runtime.tasks.holding import GripperLoadedError
 from z1_runtime.tasks.pick import PickTask
 from z1_runtime.visualization.rerun_logger import RerunLogger
 
@@ -127,6 +128,26 @@ def test_a_pick_that_holds_is_not_repeated(selector, can):
     cell.after = lambda name: cell.bench.mock.block(z1.N_ARM) if name == "approach" else None
     assert cell.pipeline.pick_until_held().held
     assert cell.ended == PHASES
+
+
+def test_a_pick_with_an_object_in_the_jaws_is_rejected_before_anything_moves(selector, can):
+    cell = Cell(selector, can)
+    cell.after = lambda name: cell.bench.mock.block(z1.N_ARM) if name == "approach" else None
+    assert cell.pipeline.pick().held
+    lifted = cell.q
+    with raises(GripperLoadedError, "gripper_loaded"):
+        cell.pipeline.pick_until_held()
+    assert cell.ended == PHASES
+    assert cell.q == pytest.approx(lifted, abs=1e-6)
+
+
+def test_a_pick_that_may_drop_opens_the_jaws(selector, can):
+    cell = Cell(selector, can)
+    cell.after = lambda name: cell.bench.mock.block(z1.N_ARM if name == "approach" else None)
+    cell.pipeline.pick()
+    cell.bench.mock.block(z1.N_ARM)  # the object of before, at the angle that the jaws have closed to
+    cell.pipeline.pick(drop=True)
+    assert cell.ended == PHASES * 2
 
 
 def test_an_object_that_a_miss_pushed_away_ends_the_attempts(selector, can):
