@@ -243,9 +243,7 @@ class Robot:
         if not drop:
             check_empty(self.state(), self.config, "pick")
 
-    def pick(
-        self, object_class: str | None = None, *, attempts: int | None = None, drop: bool = False
-    ) -> PickResult:
+    def pick(self, object_class: str | None = None, *, attempts: int | None = None, drop: bool = False) -> PickResult:
         """Pick an object from the home posture, and hold it up.
 
         Args:

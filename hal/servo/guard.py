@@ -136,7 +136,9 @@ def find_first_outside(q, q_now, joints, lower, upper, T_flange_pivot, allowed):
     """
     lowest = np.empty(3)
     for k in range(-1, len(q)):
-        box, table, own = measure_margins(q_now.reshape(1, 7) if k < 0 else q[k : k + 1], joints, lower, upper, T_flange_pivot)
+        box, table, own = measure_margins(
+            q_now.reshape(1, 7) if k < 0 else q[k : k + 1], joints, lower, upper, T_flange_pivot
+        )
         margins = (box[0], table[0], own[0])
         for i in range(3):
             if k < 0:
