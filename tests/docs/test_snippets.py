@@ -98,6 +98,7 @@ def check_pytest_options(options: list[str]) -> None:
     assert words <= known
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(
     "block", [pytest.param(block, id=f"{name_of(block[0])}:{block[1]}") for block in blocks("python")]
 )

@@ -192,6 +192,7 @@ class CountingGenerator:
         return self._inner.sample(points, n, seed)
 
 
+@pytest.mark.integration
 def test_pick_with_a_given_detector_and_generator_holds_the_box_and_repeats() -> None:
     results = []
     for _ in range(2):

@@ -166,7 +166,10 @@ def _descend(
     seed: int,
     checkpoint: Path,
 ) -> Iterator[tuple[int, float]]:
-    """Yield (iteration, loss) while AdamW runs down a cosine; `average` follows `model`. bfloat16 where the processor has it."""
+    """Yield (iteration, loss) while AdamW runs down a cosine; `average` follows `model`.
+
+    In bfloat16 where the processor has it.
+    """
     optimiser = torch.optim.AdamW(model.parameters(), lr=rate, betas=(0.9, 0.98), weight_decay=0.01)
     start = 0
     if checkpoint.exists():

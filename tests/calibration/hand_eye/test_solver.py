@@ -242,12 +242,9 @@ def test_too_few_samples_after_a_move_are_rejected() -> None:
     "mistake",
     [
         lambda r: (inverse(r.Ts_base_flange), r.Ts_camera_board),
-        lambda r: (r.Ts_base_flange, inverse(r.Ts_camera_board)),
-        lambda r: (r.Ts_base_flange[::-1], r.Ts_camera_board),
         lambda r: (r.Ts_base_flange[:-1], r.Ts_camera_board[1:]),
-        lambda r: (r.Ts_base_flange[1:], r.Ts_camera_board[:-1]),
     ],
-    ids=["arm inverted", "board inverted", "reversed", "next", "previous"],
+    ids=["arm inverted", "next"],  # test_consistency.py has all mistakes
 )
 def test_poses_in_a_wrong_order_are_diagnosed(mistake) -> None:
     with raises(CalibrationError, "flipped_order"):

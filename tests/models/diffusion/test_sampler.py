@@ -67,7 +67,7 @@ def test_turning_the_camera_turns_the_grasps_and_nothing_else(sampler):
 
 def test_most_grasps_of_new_bottles_are_valid_and_the_best_scored_more_than_the_worst(sampler):
     raw, best, worst, width_errors = [], [], [], []
-    for seed in range(50, 60):
+    for seed in range(50, 54):
         solid, points, T_camera_object = make_bottle_view(seed)
         grasps = sampler.sample(points, 200, 0)
         check = check_grasps(solid, inverse(T_camera_object) @ grasps.T_camera_grasps, GRIPPERS["agnostic"])
@@ -82,7 +82,7 @@ def test_most_grasps_of_new_bottles_are_valid_and_the_best_scored_more_than_the_
 
 def test_oversampling_gives_better_grasps_of_as_many_kinds(sampler):
     drawn_valid, chosen_valid, drawn_kinds, chosen_kinds = [], [], [], []
-    for seed in range(70, 78):
+    for seed in range(70, 74):
         solid, points, T_camera_object = make_bottle_view(seed)
         T_object_camera = inverse(T_camera_object)
         for grasps, valid, kinds in (
@@ -185,6 +185,7 @@ def test_invalid_settings_and_missing_weights_are_rejected(tmp_path):
         DiffusionSampler(DiffusionConfig(weights=tmp_path / "none.npz"))
 
 
+@pytest.mark.integration
 def test_torch_is_not_imported_until_the_sampler_is_made():
     code = "import sys, z1_runtime.factory, models.diffusion.sampler; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -87,6 +87,7 @@ def test_intrinsics_are_found_from_the_same_samples(calibrations: Path, tmp_path
     assert "<svg" in next(tmp_path.glob("intrinsics_*.html")).read_text()
 
 
+@pytest.mark.integration
 def test_tip_check_passes_with_the_result_and_not_without(calibrations: Path, tmp_path: Path):
     out = tmp_path / "tips.json"
     arguments = ["calibrate", "verify", f"--out={out}", "--corners=2", "--speed=1", *OPTIONS]
@@ -99,6 +100,7 @@ def test_tip_check_passes_with_the_result_and_not_without(calibrations: Path, tm
     assert not failed["passed"] and failed["max_mm"] > 4.0 and "drawing" in failed["calibration"]
 
 
+@pytest.mark.integration
 def test_on_a_real_arm_the_operator_types_the_offsets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     from scripts.calibrate import verify_hand_eye
 
@@ -132,6 +134,7 @@ class _NoGroundTruth:
 # --- Use by the demo ------------------------------------------------------------------------------
 
 
+@pytest.mark.integration
 def test_demo_reports_its_calibration_and_lifts_with_it(calibrations: Path, tmp_path: Path, capfd):
     arguments = ["demo", "--lockstep", f"--out={tmp_path}", f"--calibration={result_of(calibrations)}", *OPTIONS]
     assert cli.main(arguments) == 0

@@ -60,6 +60,7 @@ def test_broken_check_becomes_a_row() -> None:
     assert "inside the check" in row.found
 
 
+@pytest.mark.integration
 def test_every_check_answers_on_this_machine() -> None:
     for row in doctor.run_checks([*doctor.REQUIRED, *doctor.OPTIONAL]):
         assert "check itself failed" not in row.found, row

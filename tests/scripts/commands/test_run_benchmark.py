@@ -25,6 +25,7 @@ def short(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
 
 
+@pytest.mark.integration
 def test_a_run_of_a_users_mesh_writes_all_that_it_says(short, tmp_path, capsys):
     trimesh.creation.cylinder(28.0, height=120.0, sections=24).export(tmp_path / "tin.stl")
     out = tmp_path / "out"

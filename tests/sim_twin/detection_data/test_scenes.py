@@ -52,7 +52,7 @@ def test_the_same_seed_gives_the_same_picture_and_another_seed_another(renderer:
 @needs_egl
 def test_labels_are_of_the_three_classes_large_enough_and_apart(renderer: SceneRenderer) -> None:
     seen = 0
-    for seed in range(12):
+    for seed in range(6):
         picture = draw_scene(renderer, np.random.default_rng(seed), SceneMix(empty=0.0))
         assert picture.colour.shape == (INTRINSICS.height, INTRINSICS.width, 3)
         for label in picture.labels:
@@ -67,7 +67,7 @@ def test_labels_are_of_the_three_classes_large_enough_and_apart(renderer: SceneR
         stacked = sum(label.mask.astype(int) for label in picture.labels)
         assert np.max(stacked) <= 1
         seen += len(picture.labels)
-    assert seen >= 6
+    assert seen >= 3
 
 
 @needs_egl
@@ -135,7 +135,7 @@ def test_what_an_occluder_covers_belongs_to_no_label_and_what_hardly_shows_is_ta
 
 @needs_egl
 def test_every_label_shows_enough_of_its_outline(renderer: SceneRenderer) -> None:
-    for seed in range(20, 32):
+    for seed in range(20, 26):
         picture = draw_scene(renderer, np.random.default_rng(seed), SceneMix(empty=0.0, wrist=0.0, occluded=1.0))
         camera = renderer.T_base_camera("free")
         for label in picture.labels:
@@ -152,7 +152,7 @@ def test_every_label_shows_enough_of_its_outline(renderer: SceneRenderer) -> Non
 def test_a_bottle_without_its_neck_has_no_label_where_colours_tell_nothing(renderer: SceneRenderer) -> None:
     """Its shoulder cut off by the picture's border, a bottle in random colours is a cylinder."""
     seen = {True: 0, False: 0}
-    for seed in range(40, 100):
+    for seed in range(40, 70):
         rng = np.random.default_rng(seed)
         picture = draw_scene(renderer, rng, SceneMix(empty=0.0, twin=0.0, own=0.0, wrist=0.0, occluded=0.0))
         camera = renderer.T_base_camera("free")
@@ -164,7 +164,7 @@ def test_a_bottle_without_its_neck_has_no_label_where_colours_tell_nothing(rende
             neck = project_outline(corners, camera, renderer.intrinsics)
             assert neck is not None
             seen[visible_ratio(mask, neck) >= MIN_MARK_RATIO] += 1
-    assert seen[True] >= 5
+    assert seen[True] >= 3
     assert seen[False] == 0
 
 
@@ -228,7 +228,7 @@ def test_a_photograph_is_noisy_in_every_channel_and_brought_to_a_fair_exposure()
 def test_a_crowd_shows_more_objects(renderer: SceneRenderer) -> None:
     def shown(crowd: float) -> list[int]:
         mix = SceneMix(empty=0.0, twin=0.0, own=0.0, crowd=crowd)
-        return [len(draw_scene(renderer, np.random.default_rng([5, n]), mix).labels) for n in range(8)]
+        return [len(draw_scene(renderer, np.random.default_rng([5, n]), mix).labels) for n in range(5)]
 
     few, many = shown(0.0), shown(1.0)
     assert max(few) <= 3
@@ -241,7 +241,7 @@ def test_the_number_of_distractors_can_be_raised(renderer: SceneRenderer) -> Non
     def shown(distractors: float) -> int:
         mix = SceneMix(crowd=0.5, occluded=0.0, distractors=distractors)
         counts = []
-        for n in range(8):
+        for n in range(4):
             draw_scene(renderer, np.random.default_rng([6, n]), mix)
             counts.append(sum(renderer.is_shown(instance) for instance in renderer.distractors()))
         return sum(counts)
@@ -255,7 +255,7 @@ def test_the_number_of_distractors_can_be_raised(renderer: SceneRenderer) -> Non
 def test_every_mug_shows_its_handle(renderer: SceneRenderer) -> None:
     """Without it a mug is a cylinder, which a picture must not show without a label."""
     seen = 0
-    for seed in range(200, 260):
+    for seed in range(200, 245):
         draw_scene(renderer, np.random.default_rng(seed), SceneMix(empty=1.0, wrist=0.0))
         for mug in renderer.distractors():
             if mug.prop.kind != "mug" or not renderer.is_shown(mug):

@@ -79,6 +79,7 @@ def test_calibration_corrects_an_overconfident_discriminator(data, tmp_path):
     assert (scale, offset) != (1.0, 0.0)
 
 
+@pytest.mark.integration
 def test_the_discriminator_learns_from_labelled_samples(data, tmp_path):
     torch.set_num_threads(1)
     config = TrainingConfig(discriminator_iterations=12)

@@ -42,6 +42,7 @@ class Grasped:
         monkeypatch.setattr(EpisodeRobot, "execute", execute)
 
 
+@pytest.mark.integration
 def test_after_a_miss_the_object_is_found_where_it_then_is(selector, monkeypatch):
     grasped = Grasped(monkeypatch, missing=1)
     (row,) = run_scenario(SCENARIO, [MVB], lambda *_: selector, top_k=3)
@@ -99,6 +100,7 @@ def test_what_would_stop_a_real_arm_is_not_tried_again(selector, monkeypatch, mo
     assert (row["attempts"], row["modes"]) == (1, [mode.value])
 
 
+@pytest.mark.integration
 def test_what_slipped_but_hangs_is_put_down_before_the_jaws_open(selector):
     frame, q = capture(SCENARIO.scene())
     plan = selector.select(frame, q).plan

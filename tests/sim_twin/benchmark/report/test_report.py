@@ -34,9 +34,11 @@ def write(path, rows, **more):
     return path.read_text()
 
 
-@pytest.fixture
-def page(tmp_path):
-    return write(tmp_path / "report.html", make_rows(("vanilla", "mvb", "full"), occlusions=(0.0, 0.25)))
+@pytest.fixture(scope="module")
+def page(tmp_path_factory):
+    return write(
+        tmp_path_factory.mktemp("report") / "report.html", make_rows(("vanilla", "mvb", "full"), occlusions=(0.0, 0.25))
+    )
 
 
 def test_the_page_needs_no_other_file(page):
