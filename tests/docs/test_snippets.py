@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import re
 import shlex
 import tomllib
@@ -108,6 +109,16 @@ def test_python_block_runs(block: tuple[Path, int, str, bool], tmp_path: Path, m
         pytest.skip("needs hardware")
     monkeypatch.chdir(tmp_path)
     exec(compile("\n" * line + source, str(page), "exec"), {"__name__": "snippet"})  # tracebacks show the page's line
+
+
+def test_every_python_block_is_python_and_imports_what_exists() -> None:
+    for page, line, source, _ in blocks("python"):
+        tree = ast.parse("\n" * line + source, str(page))
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ImportFrom) and node.module:
+                module = import_module(node.module)
+                for name in node.names:
+                    assert hasattr(module, name.name), f"{name_of(page)}:{node.lineno}"
 
 
 def test_only_hardware_exempts_a_block() -> None:
