@@ -24,7 +24,7 @@ os.environ["Z1_CALIBRATIONS"] = "/nonexistent/calibrations"
 _RUNTIME_FOLDER = tempfile.TemporaryDirectory(prefix="z1-test-")
 os.environ["XDG_RUNTIME_DIR"] = _RUNTIME_FOLDER.name
 
-_OFF_BY_DEFAULT = ("hardware", "slow")
+_OFF_BY_DEFAULT = ("hardware", "slow", "vendor")
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

@@ -141,11 +141,13 @@ def uses_of_the_time(name: str, source: str) -> list[str]:
     return found
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("path", sources(*ROOMS), ids=name_of)
 def test_imports_run_down_only(path: Path) -> None:
     assert forbidden_imports(name_of(path), path.read_text()) == []
 
 
+@pytest.mark.integration
 def test_no_import_cycle_between_modules_or_folders() -> None:
     modules = module_graph({name_of(path): path.read_text() for path in sources(*ROOMS)})
     assert cycles(modules) == []

@@ -184,6 +184,7 @@ def test_missing_folders_and_files_are_rejected(tmp_path: Path) -> None:
         load_result(tmp_path / "none.json")
 
 
+@pytest.mark.integration
 def test_report_has_plots_ground_truth_and_dropped_samples_in_one_file(tmp_path: Path) -> None:
     recording = record(0, 10)
     recording.Ts_base_flange[3, :3, 3] += 0.02

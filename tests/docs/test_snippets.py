@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import re
 import shlex
 import tomllib
@@ -98,6 +99,7 @@ def check_pytest_options(options: list[str]) -> None:
     assert words <= known
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(
     "block", [pytest.param(block, id=f"{name_of(block[0])}:{block[1]}") for block in blocks("python")]
 )
@@ -109,10 +111,21 @@ def test_python_block_runs(block: tuple[Path, int, str, bool], tmp_path: Path, m
     exec(compile("\n" * line + source, str(page), "exec"), {"__name__": "snippet"})  # tracebacks show the page's line
 
 
+def test_every_python_block_is_python_and_imports_what_exists() -> None:
+    for page, line, source, _ in blocks("python"):
+        tree = ast.parse("\n" * line + source, str(page))
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ImportFrom) and node.module:
+                module = import_module(node.module)
+                for name in node.names:
+                    assert hasattr(module, name.name), f"{name_of(page)}:{node.lineno}"
+
+
 def test_only_hardware_exempts_a_block() -> None:
     assert sum(marked for *_, marked in blocks("python")) == NOT_RUN
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("line", commands("./z1"))
 def test_command_line_is_accepted(line: str) -> None:
     check_command(line)

@@ -33,6 +33,7 @@ def test_pick_bottle_holds_it() -> None:
     assert load("pick_bottle")["main"]()
 
 
+@pytest.mark.integration
 def test_grabbed_cloud_holds_table_and_object() -> None:
     cloud = load("grab_frame_and_cloud")["main"]()
     assert len(cloud) > 50_000
@@ -40,6 +41,7 @@ def test_grabbed_cloud_holds_table_and_object() -> None:
     assert cloud[:, 2].max() > 0.05
 
 
+@pytest.mark.integration
 def test_moved_arm_is_at_the_pose() -> None:
     state = load("move_arm")["main"]()
     kinematics = ForwardKinematics()

@@ -63,6 +63,7 @@ def _episode(seed: int) -> list[bytes]:
     return record
 
 
+@pytest.mark.integration
 def test_the_same_seed_and_calls_give_the_same_bytes_and_another_seed_other_noise() -> None:
     first, again, other = _episode(0), _episode(0), _episode(1)
     assert first == again
@@ -70,6 +71,7 @@ def test_the_same_seed_and_calls_give_the_same_bytes_and_another_seed_other_nois
     assert first != other
 
 
+@pytest.mark.integration
 def test_frames_come_thirty_times_a_second_and_count_up(rig: Rig) -> None:
     frames = [rig.camera.wait_for_frame(0.1) for _ in range(4)]
     assert [frame.sequence for frame in frames] == [1, 2, 3, 4]
@@ -91,6 +93,7 @@ def test_a_frame_holds_colour_depth_and_the_objects_mask(rig: Rig) -> None:
     assert red[0] > 1.5 * red[2]  # the cylinder is red
 
 
+@pytest.mark.integration
 def test_without_noise_depth_is_whole_and_colour_clean() -> None:
     camera = TwinCamera(World(SceneConfig(object="cylinder", noise=False)))
     camera.connect()
@@ -171,6 +174,7 @@ def test_the_camera_may_be_read_from_another_thread_than_it_was_opened_in(rig: R
     assert frames[0].colour.std() > 10
 
 
+@pytest.mark.integration
 def test_two_cameras_may_draw_at_the_same_time() -> None:
     cameras = [TwinCamera(World(SceneConfig(object=name, noise=False))) for name in ("box", "cylinder")]
     for camera in cameras:

@@ -18,6 +18,7 @@ from z1_runtime.motion.limits import MotionLimits
 from z1_runtime.planning.config import PlannerConfig
 
 
+@pytest.mark.integration
 def test_each_name_makes_its_generator():
     assert isinstance(make_generator("antipodal"), AntipodalSampler)
     assert isinstance(make_generator("diffusion"), DiffusionSampler)
@@ -43,6 +44,7 @@ def test_a_file_may_choose_a_generator_without_learning(tmp_path):
     assert RuntimeConfig().generator == "diffusion"
 
 
+@pytest.mark.integration
 def test_the_parts_get_the_configuration_s_numbers():
     config = replace(RuntimeConfig(), speed=0.25, planner=PlannerConfig(lift_m=0.05))
     moved = z1.T_FLANGE_CAMERA.copy()
@@ -55,6 +57,7 @@ def test_the_parts_get_the_configuration_s_numbers():
     assert isinstance(selector.generator, DiffusionSampler)
 
 
+@pytest.mark.integration
 def test_planner_and_selector_share_one_model_of_the_arm():
     selector = make_grasp_selector(RuntimeConfig())
     assert selector.planner._kinematics is selector.kinematics

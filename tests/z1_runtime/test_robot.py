@@ -244,6 +244,7 @@ class CountingGenerator:
         return self._inner.sample(points, n, seed)
 
 
+@pytest.mark.integration
 def test_pick_with_a_given_detector_and_generator_holds_the_box_and_repeats() -> None:
     results = []
     for _ in range(2):
@@ -265,6 +266,7 @@ class LabelledDetector(GroundTruthDetector):
     classes = ("bottle",)
 
 
+@pytest.mark.integration
 def test_unknown_class_is_rejected_before_and_after_loading() -> None:
     config = RuntimeConfig(n_candidates=200)
     with Robot.simulate("box", config=config, detector=LabelledDetector(), generator=AntipodalSampler()) as robot:

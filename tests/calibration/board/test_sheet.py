@@ -25,6 +25,7 @@ def detected_extent_mm(page: np.ndarray, board: Board) -> np.ndarray:
     return (view.pixels_px[-1] - view.pixels_px[0]) * 25.4 / 200
 
 
+@pytest.mark.integration
 def test_png_carries_its_resolution_and_is_true_to_scale(tmp_path: Path) -> None:
     save_sheet(Board(), tmp_path / "board.png")
     with Image.open(tmp_path / "board.png") as image:
@@ -34,6 +35,7 @@ def test_png_carries_its_resolution_and_is_true_to_scale(tmp_path: Path) -> None
     np.testing.assert_allclose(detected_extent_mm(page, Board()), [150.0, 100.0], atol=0.05)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(
     ("board", "paper", "size_mm"),
     [
@@ -71,6 +73,7 @@ def read_page(pdf: bytes) -> np.ndarray:
         return np.asarray(image.convert("L"))
 
 
+@pytest.mark.integration
 def test_pdf_shows_the_board_at_its_size_and_the_same_page_as_the_png(tmp_path: Path) -> None:
     save_sheet(Board(), tmp_path / "board.pdf")
     page = read_page((tmp_path / "board.pdf").read_bytes())

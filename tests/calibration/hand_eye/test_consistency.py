@@ -61,6 +61,7 @@ def test_fixed_scale_is_kept() -> None:
     assert fit_robust(data, fit).fit.scale != 1.0
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("first", [5, 12])
 def test_move_of_the_board_is_located_and_measured(first: int) -> None:
     data = noisy_problem(3)
@@ -75,6 +76,7 @@ def test_move_of_the_board_is_located_and_measured(first: int) -> None:
     assert move.deg == pytest.approx(np.degrees(0.02), abs=0.1)
 
 
+@pytest.mark.integration
 def test_fixed_board_has_no_move_even_with_an_outlier() -> None:
     for data in (noisy_problem(4), move_arm(noisy_problem(4), [9], [0.02, 0.0, 0.0, 0.0, 0.0, 0.0])):
         assert detect_board_move(data, make_initial_fit(data)) is None
@@ -89,6 +91,7 @@ MISTAKES: dict[str, Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndar
 }
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("mistake", MISTAKES)
 def test_mistakes_in_the_order_are_diagnosed(mistake: str) -> None:
     data = noisy_problem(5, 12)
@@ -98,6 +101,7 @@ def test_mistakes_in_the_order_are_diagnosed(mistake: str) -> None:
     assert ("poses are inverted" if mistake in ("arm's", "board's") else mistake) in diagnosis
 
 
+@pytest.mark.integration
 def test_correct_and_unrelated_poses_have_no_diagnosis() -> None:
     one, other = noisy_problem(6, 12), noisy_problem(7, 12)
     assert diagnose_pose_order(one.Ts_anchor_mount, one.Ts_camera_board) is None

@@ -103,6 +103,7 @@ def test_sample_without_weight_has_no_influence() -> None:
     np.testing.assert_allclose(fit.T_mount_camera, T_FLANGE_CAMERA, atol=1e-8)
 
 
+@pytest.mark.integration
 def test_covariance_agrees_with_monte_carlo() -> None:
     errors, P = [], np.zeros(0)
     for seed in range(60):

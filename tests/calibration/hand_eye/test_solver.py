@@ -46,6 +46,7 @@ def good() -> HandEyeResult:
     return solved(record(0))
 
 
+@pytest.mark.integration
 def test_twenty_poses_find_the_camera_to_half_a_millimetre_and_a_tenth_of_a_degree(good: HandEyeResult) -> None:
     mm, deg = pose_distances_mm_deg(good.T_flange_camera, T_FLANGE_CAMERA)
     assert mm <= 0.5
@@ -79,6 +80,7 @@ def test_the_hold_out_error_is_larger_than_the_residual(good: HandEyeResult) -> 
     assert good.rms_mm < good.holdout_mm < 2.0 * good.rms_mm
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("arm", [0.0, 5.0])
 def test_uncertainty_follows_the_scatter_of_the_arm_and_covers_the_error(arm: float, good: HandEyeResult) -> None:
     result = solved(record(1, arm_m=arm * 1e-4, arm_deg=arm * 0.01))
@@ -98,6 +100,7 @@ def test_the_uncertainty_covers_the_true_error_in_at_least_18_of_20_sessions() -
     assert covered >= 18
 
 
+@pytest.mark.integration
 def test_two_outliers_of_twenty_are_named_and_dropped() -> None:
     recording = corrupt(record(2), 4, np.array([0.004, 0.0, 0.003, 0.0, 0.0, 0.01]))
     recording = corrupt(recording, 17, np.array([0.0, -0.02, 0.0, 0.03, 0.0, 0.0]))
@@ -111,6 +114,7 @@ def test_two_outliers_of_twenty_are_named_and_dropped() -> None:
     assert pose_distances_mm_deg(result.T_flange_camera, T_FLANGE_CAMERA)[0] <= 0.5
 
 
+@pytest.mark.integration
 def test_a_few_wrong_corners_do_no_harm() -> None:
     recording = record(3)
     for view in recording.views[::4]:
@@ -125,6 +129,7 @@ def test_without_refinement_the_poses_alone_do() -> None:
     assert pose_distances_mm_deg(result.T_flange_camera, T_FLANGE_CAMERA)[0] <= 1.0
 
 
+@pytest.mark.integration
 def test_eye_to_hand_camera_is_found() -> None:
     recording = record(4)
     # The same samples with the roles of base and flange exchanged
@@ -139,6 +144,7 @@ def test_eye_to_hand_camera_is_found() -> None:
         _ = result.T_flange_camera
 
 
+@pytest.mark.integration
 def test_another_base_frame_changes_nothing_of_the_camera(good: HandEyeResult) -> None:
     recording = record(0)
     T_other_base = apply_increment(np.eye(4), np.array([0.5, -1.0, 0.2, 0.4, -0.7, 2.0]))
@@ -148,6 +154,7 @@ def test_another_base_frame_changes_nothing_of_the_camera(good: HandEyeResult) -
     assert result.uncertainty_mm == pytest.approx(good.uncertainty_mm, rel=0.05)
 
 
+@pytest.mark.integration
 def test_another_flange_frame_moves_the_camera_by_it(good: HandEyeResult) -> None:
     recording = record(0)
     T_other_flange = apply_increment(np.eye(4), np.array([0.0, 0.0, 0.0, 0.3, -0.2, 1.0]))
@@ -157,6 +164,7 @@ def test_another_flange_frame_moves_the_camera_by_it(good: HandEyeResult) -> Non
     np.testing.assert_allclose(T_other_flange @ result.T_flange_camera, good.T_flange_camera, atol=5e-5)
 
 
+@pytest.mark.integration
 def test_few_poses_give_a_warning_and_very_few_are_rejected() -> None:
     recording = record(5, 7)
     assert "too_few_poses" in codes(solved(recording))
@@ -181,6 +189,7 @@ def test_similar_poses_are_rejected() -> None:
         solved(recording)
 
 
+@pytest.mark.integration
 def test_rather_similar_poses_give_a_warning() -> None:
     recording = record_rotations(np.random.default_rng(1).uniform(-6.0, 6.0, (12, 3)))
     assert "too_similar_poses" in codes(solved(recording))
@@ -192,6 +201,7 @@ def test_rotations_about_one_axis_are_rejected() -> None:
         solved(record_rotations(turns))
 
 
+@pytest.mark.integration
 def test_weak_second_axis_gives_a_warning() -> None:
     turns = np.outer(np.linspace(-40.0, 40.0, 12), [0.0, 0.0, 1.0]) + 3.0 * np.array([[1, 0, 0], [-1, 0, 0]] * 6)
     result = solved(record_rotations(turns))
@@ -199,6 +209,7 @@ def test_weak_second_axis_gives_a_warning() -> None:
     assert result.diversity < 0.9
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("scale", [0.99, 1.04])
 def test_wrong_square_size_is_measured(scale: float) -> None:
     result = solved(record(8, scale=scale))
@@ -208,10 +219,12 @@ def test_wrong_square_size_is_measured(scale: float) -> None:
     assert pose_distances_mm_deg(result.T_flange_camera, T_FLANGE_CAMERA)[0] <= 1.0
 
 
+@pytest.mark.integration
 def test_print_wrong_by_a_thousandth_gives_no_warning() -> None:
     assert "wrong_square_size" not in codes(solved(record(8, scale=1.001)))
 
 
+@pytest.mark.integration
 def test_moved_board_is_reported_with_sample_and_distance() -> None:
     moves = np.repeat(T_BASE_BOARD[None], 20, axis=0)
     moves[13:] = apply_increment(T_BASE_BOARD, np.array([0.005, 0.0, 0.0, 0.0, 0.0, 0.0]))
@@ -223,6 +236,7 @@ def test_moved_board_is_reported_with_sample_and_distance() -> None:
     assert_covered(result)
 
 
+@pytest.mark.integration
 def test_a_board_that_moved_early_leaves_the_samples_after_it() -> None:
     moves = np.repeat(T_BASE_BOARD[None], 20, axis=0)
     moves[6:] = apply_increment(T_BASE_BOARD, np.array([0.0, 0.02, 0.0, 0.0, 0.0, 0.1]))
@@ -238,22 +252,21 @@ def test_too_few_samples_after_a_move_are_rejected() -> None:
         solved(record(11, 8, T_base_boards=moves))
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(
     "mistake",
     [
         lambda r: (inverse(r.Ts_base_flange), r.Ts_camera_board),
-        lambda r: (r.Ts_base_flange, inverse(r.Ts_camera_board)),
-        lambda r: (r.Ts_base_flange[::-1], r.Ts_camera_board),
         lambda r: (r.Ts_base_flange[:-1], r.Ts_camera_board[1:]),
-        lambda r: (r.Ts_base_flange[1:], r.Ts_camera_board[:-1]),
     ],
-    ids=["arm inverted", "board inverted", "reversed", "next", "previous"],
+    ids=["arm inverted", "next"],  # test_consistency.py has all mistakes
 )
 def test_poses_in_a_wrong_order_are_diagnosed(mistake) -> None:
     with raises(CalibrationError, "flipped_order"):
         solve_hand_eye(*mistake(record(12, 12)))
 
 
+@pytest.mark.integration
 def test_unrelated_samples_are_rejected() -> None:
     one, other = record(13, 12), record(14, 12)
     with raises(CalibrationError, "inconsistent"):

@@ -95,6 +95,7 @@ def test_send_returns_what_is_applied(ready: ArmCase) -> None:
     assert applied.q == pytest.approx(q, abs=0.01)
 
 
+@pytest.mark.integration
 def test_a_setpoint_is_followed(ready: ArmCase) -> None:
     goal = np.clip(ready.arm.read_state().q, Q_MIN, Q_MAX)
     goal[0] += 0.1
@@ -102,6 +103,7 @@ def test_a_setpoint_is_followed(ready: ArmCase) -> None:
     assert ready.arm.read_state().q[0] == pytest.approx(goal[0], abs=0.02)
 
 
+@pytest.mark.integration
 def test_a_setpoint_beyond_the_limits_is_clipped(ready: ArmCase) -> None:
     start = np.clip(ready.arm.read_state().q, Q_MIN, Q_MAX)
     for beyond in (Q_MAX + 1.0, Q_MIN - 1.0):
@@ -112,6 +114,7 @@ def test_a_setpoint_beyond_the_limits_is_clipped(ready: ArmCase) -> None:
         assert ready.arm.read_state().q[4] == pytest.approx(applied[4], abs=0.03)
 
 
+@pytest.mark.integration
 def test_stop_makes_the_arm_hold(ready: ArmCase) -> None:
     goal = np.clip(ready.arm.read_state().q, Q_MIN, Q_MAX)
     goal[0] += 2.0
@@ -124,6 +127,7 @@ def test_stop_makes_the_arm_hold(ready: ArmCase) -> None:
     assert np.abs(ready.arm.read_state().q - held)[:N_ARM].max() < 0.01
 
 
+@pytest.mark.integration
 def test_a_stopped_arm_can_be_moved_again(ready: ArmCase) -> None:
     ready.arm.stop()
     ready.clock.sleep_until(ready.clock.now_s() + 0.1)
@@ -137,6 +141,7 @@ def test_a_stopped_arm_can_be_moved_again(ready: ArmCase) -> None:
 # --- Cameras ------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.integration
 def test_a_camera_satisfies_the_contract(view: CameraCase) -> None:
     view.camera.connect()
     assert isinstance(view.camera, Camera)
@@ -149,6 +154,7 @@ def test_a_camera_cannot_be_used_before_it_is_connected(view: CameraCase) -> Non
         _ = view.camera.intrinsics
 
 
+@pytest.mark.integration
 def test_a_camera_may_be_connected_twice_and_disconnected_twice(view: CameraCase) -> None:
     view.camera.disconnect()
     view.camera.connect()
@@ -160,6 +166,7 @@ def test_a_camera_may_be_connected_twice_and_disconnected_twice(view: CameraCase
         view.camera.wait_for_frame(0.1)
 
 
+@pytest.mark.integration
 def test_frames_count_up_and_are_exposed_after_the_call(view: CameraCase) -> None:
     view.camera.connect()
     last = None
@@ -173,6 +180,7 @@ def test_frames_count_up_and_are_exposed_after_the_call(view: CameraCase) -> Non
         last = frame
 
 
+@pytest.mark.integration
 def test_a_frame_matches_the_intrinsics_and_is_plausible(view: CameraCase) -> None:
     view.camera.connect()
     frame = view.camera.wait_for_frame(1.0)
@@ -184,6 +192,7 @@ def test_a_frame_matches_the_intrinsics_and_is_plausible(view: CameraCase) -> No
     assert (frame.depth_m > 0).mean() > 0.2
 
 
+@pytest.mark.integration
 def test_a_frame_is_read_only(view: CameraCase) -> None:
     view.camera.connect()
     frame = view.camera.wait_for_frame(1.0)
@@ -191,6 +200,7 @@ def test_a_frame_is_read_only(view: CameraCase) -> None:
         assert not array.flags.writeable
 
 
+@pytest.mark.integration
 def test_a_frame_that_does_not_come_in_time_is_an_error(view: CameraCase) -> None:
     view.camera.connect()
     view.camera.wait_for_frame(1.0)

@@ -17,6 +17,7 @@ def random_pose(rng: np.random.Generator) -> np.ndarray:
     return transforms.make_pose(Rotation.random(rng=rng).as_matrix(), rng.uniform(-1.0, 1.0, 3))
 
 
+@pytest.mark.integration
 @given(SEEDS)
 def test_a_pose_times_its_inverse_is_the_identity(seed: int) -> None:
     rng = np.random.default_rng(seed)

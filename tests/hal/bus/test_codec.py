@@ -228,6 +228,7 @@ _JSON = st.recursive(
 )
 
 
+@pytest.mark.integration
 @given(st.sampled_from(SAMPLES), st.data())
 def test_any_value_in_any_field_gives_a_message_or_a_rejection(sample, draw):
     field = draw.draw(st.sampled_from([field.name for field in dataclasses.fields(sample)]))

@@ -211,6 +211,7 @@ def test_a_body_that_is_too_long_is_never_sent() -> None:
         controller.encode_command(Fsm.LOWCMD, JointCommands(**{n: np.zeros(8) for n in ("q", "dq", "tau", "kp", "kd")}))
 
 
+@pytest.mark.integration
 def test_random_datagrams_are_decoded_or_rejected_and_nothing_else() -> None:
     """100,000 packets: random bytes of random sizes, and good packets with a few bytes changed."""
     rng = np.random.default_rng(5)

@@ -85,6 +85,7 @@ def iou(a, b):
     return (a & b).sum() / max((a | b).sum(), 1)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("shape", [SIZE, (300, 500), (500, 200), (97, 131)])
 def test_boxes_and_masks_are_those_of_ultralytics(ours, checkpoint, shape):
     image = picture(*shape)
@@ -119,6 +120,7 @@ def test_every_class_of_a_box_counts_as_in_ultralytics_validator(ours):
     assert at_one_place.most_common(1)[0][1] > 1
 
 
+@pytest.mark.integration
 def test_a_network_without_masks_gives_boxes_alone(tmp_path):
     path = tmp_path / "boxes.pt"
     save_checkpoint(path, detecting(), ("bottle", "cup", "dog"), "detect")
@@ -132,6 +134,7 @@ def test_a_network_without_masks_gives_boxes_alone(tmp_path):
     assert all(d.mask is None for d in found)
 
 
+@pytest.mark.integration
 def test_detections_in_a_mirrored_image_are_the_mirrored_detections(ours):
     """The network alone is not symmetric: without averaging the detections differ."""
     image = picture(*SIZE)
@@ -159,6 +162,7 @@ def test_a_network_with_other_anchors_processes_the_image_alone(ours, monkeypatc
     assert boxes[0] == boxes[1]
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("runtime", RUNTIMES)
 def test_every_runtime_gives_the_same_outputs(ours, network, runtime):
     opened = open_network(ours, runtime)
@@ -175,6 +179,7 @@ def test_every_runtime_gives_the_same_outputs(ours, network, runtime):
     assert np.corrcoef(prototypes.ravel(), true_prototypes.ravel())[0, 1] > 0.95
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("runtime", RUNTIMES)
 def test_detection_repeats_bit_by_bit(ours, runtime):
     detector = YoloModel(YoloConfig(weights=ours, runtime=runtime))
@@ -185,6 +190,7 @@ def test_detection_repeats_bit_by_bit(ours, runtime):
         assert (a.mask == b.mask).all()
 
 
+@pytest.mark.integration
 def test_torch_keeps_the_configured_number_of_threads(ours):
     torch.set_num_threads(2)
     YoloModel(YoloConfig(weights=ours, runtime="torch")).detect(picture(*SIZE))
@@ -193,6 +199,7 @@ def test_torch_keeps_the_configured_number_of_threads(ours):
     assert chosen == 2
 
 
+@pytest.mark.integration
 def test_the_first_installed_runtime_is_used(ours, monkeypatch):
     assert installed_runtimes(ours) == RUNTIMES  # the tests' environment has them all
     assert YoloModel(YoloConfig(weights=ours)).runtime == "openvino"
@@ -209,6 +216,7 @@ def test_the_first_installed_runtime_is_used(ours, monkeypatch):
         open_network(ours)
 
 
+@pytest.mark.integration
 def test_detections_are_sorted_by_confidence_and_limited(ours):
     detector = YoloModel(YoloConfig(weights=ours, max_detections=5))
     found = detector.detect(picture(*SIZE), min_confidence=0.1)
@@ -218,6 +226,7 @@ def test_detections_are_sorted_by_confidence_and_limited(ours):
     assert all(d.confidence > 0.5 for d in detector.detect(picture(*SIZE)))
 
 
+@pytest.mark.integration
 def test_the_export_is_cached_for_each_weights_file(ours, cache, network, tmp_path):
     open_network(ours, "onnxruntime")
     (made,) = cache.glob(f"{ours.stem}-*.onnx")
@@ -244,6 +253,7 @@ def test_exchanged_weights_are_rejected_despite_an_export(ours, tmp_path):
         open_network(copy, "onnxruntime")
 
 
+@pytest.mark.integration
 def test_without_a_writable_home_the_export_is_temporary(ours, monkeypatch, tmp_path):
     file = tmp_path / "file"
     file.touch()
@@ -252,6 +262,7 @@ def test_without_a_writable_home_the_export_is_temporary(ours, monkeypatch, tmp_
     assert export_to_onnx(ours).is_relative_to(tmp_path)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("runtime", ["openvino", "onnxruntime"])
 def test_an_onnx_file_of_a_user_is_read(ours, tmp_path, runtime):
     path = tmp_path / "mine.onnx"
@@ -262,6 +273,7 @@ def test_an_onnx_file_of_a_user_is_read(ours, tmp_path, runtime):
         open_network(path, "torch")
 
 
+@pytest.mark.integration
 def test_an_openvino_folder_of_a_user_is_read(ours, tmp_path):
     import openvino
 
@@ -276,6 +288,7 @@ def test_an_openvino_folder_of_a_user_is_read(ours, tmp_path):
     assert found[0][0].box_px == found[1][0].box_px
 
 
+@pytest.mark.integration
 def test_what_ultralytics_exports_is_read(checkpoint, tmp_path):
     from ultralytics import YOLO
 
@@ -318,6 +331,7 @@ def test_a_folder_without_a_graph_is_rejected(tmp_path):
         open_network(tmp_path)
 
 
+@pytest.mark.integration
 def test_a_checkpoint_of_another_task_is_rejected(tmp_path):
     from ultralytics.nn.tasks import ClassificationModel, PoseModel
 
@@ -397,6 +411,7 @@ def test_an_unknown_runtime_is_rejected_with_the_known_ones(ours):
     assert all(word in str(caught.value) for word in ("tensorrt", "auto", *RUNTIMES))
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(
     "image", [np.zeros((48, 64), np.uint8), np.zeros((48, 64, 3)), np.zeros((0, 64, 3), np.uint8)], ids=str
 )

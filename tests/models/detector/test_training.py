@@ -40,6 +40,7 @@ def test_the_loss_in_bfloat16_differs_by_rounding_only() -> None:
     assert ours.sum().item() == pytest.approx(plain.sum().item(), rel=0.1)
 
 
+@pytest.mark.integration
 def test_a_complete_phase_is_not_repeated_and_gives_finite_weights(tmp_path: Path) -> None:
     for split in ("train", "val"):
         (tmp_path / "images" / split).mkdir(parents=True)

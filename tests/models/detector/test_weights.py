@@ -18,6 +18,7 @@ def saved(tmp_path_factory):
     return network, path
 
 
+@pytest.mark.integration
 def test_a_saved_detector_gives_the_same_outputs(saved):
     network, path = saved
     loaded = load_detector(path)

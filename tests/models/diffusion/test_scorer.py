@@ -38,6 +38,7 @@ def as_set(T: np.ndarray, width_m: float = np.nan) -> GraspSet:
     return GraspSet(T_camera_grasps=T, scores=np.zeros(len(T)), widths_m=np.full(len(T), width_m))
 
 
+@pytest.mark.integration
 def test_scores_of_the_samplers_grasps_correlate_with_its_own(scorer, box_view):
     points = box_view[1]
     # None are dropped, so valid and invalid ones; the sampler scores them before their axes are orthonormalised.
@@ -46,6 +47,7 @@ def test_scores_of_the_samplers_grasps_correlate_with_its_own(scorer, box_view):
     assert np.corrcoef(scores, grasps.scores)[0, 1] > 0.8
 
 
+@pytest.mark.integration
 def test_valid_grasps_score_above_the_same_turned_by_90_degrees(scorer, box_view):
     solid, points, T_camera_object = box_view
     grasps = DiffusionSampler().sample(points, 200, 1)
@@ -58,6 +60,7 @@ def test_valid_grasps_score_above_the_same_turned_by_90_degrees(scorer, box_view
     assert fails.sum() > 20 and held.mean() > missed.mean() + 0.2
 
 
+@pytest.mark.integration
 def test_concurrent_calls_give_the_same_scores_as_single_ones(scorer, box_view):
     points = box_view[1]
     grasps = DiffusionSampler().sample(points, 40, 2)

@@ -97,12 +97,14 @@ def test_each_failure_is_reported_and_the_next_request_is_served(served, seed, e
     assert len(served.sample(CLOUD, 4, 0)) == 4
 
 
+@pytest.mark.integration
 def test_a_process_that_hangs_is_ended_after_the_timeout(tmp_path):
     generator = make(tmp_path, READY + SERVE, timeout_s=0.5)
     with raises(GeneratorError, "process_timeout"):
         generator.sample(CLOUD, 1, 3)
 
 
+@pytest.mark.integration
 def test_ctrl_c_while_waiting_ends_the_process(tmp_path, monkeypatch):
     generator = make(tmp_path, READY + SERVE)
     child = generator._child
@@ -118,6 +120,7 @@ def test_ctrl_c_while_waiting_ends_the_process(tmp_path, monkeypatch):
     assert len(generator.sample(CLOUD, 1, 0)) == 1
 
 
+@pytest.mark.integration
 def test_a_failed_start_is_reported_with_the_last_lines_of_stderr(tmp_path):
     with raises(GeneratorError, "process_ended") as caught:
         make(tmp_path, "import grasp_gem")
@@ -133,6 +136,7 @@ def test_another_protocol_version_is_rejected(tmp_path):
         make(tmp_path, 'pipe.write_message(out, {"protocol": 99})')
 
 
+@pytest.mark.integration
 def test_the_process_ends_when_the_generator_is_collected(tmp_path):
     generator = make(tmp_path, READY + SERVE)
     child = generator._child
@@ -159,6 +163,7 @@ def test_the_worker_imports_nothing_but_numpy_and_the_light_part_of_this_project
     assert done.stderr.decode().strip().splitlines()[-1] == f"[] {['hal.base.errors', *facts]} 1"
 
 
+@pytest.mark.integration
 def test_the_real_worker_reports_a_missing_checkpoint(tmp_path):
     with raises(GeneratorError, "checkpoint_missing"):
         ProcessGenerator("graspgen", tmp_path / "none.yml", PYTHON)

@@ -125,6 +125,7 @@ def test_unusable_settings_and_counts_are_rejected():
         ObbSweepSampler().sample(corner_view(), 0, seed=0)
 
 
+@pytest.mark.integration
 def test_it_needs_neither_torch_nor_numba():
     code = "import sys, models.samplers.obb_sweep; sys.exit(bool({'torch', 'numba'} & set(sys.modules)))"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

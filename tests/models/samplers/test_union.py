@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from hal.base.errors import InvalidValueError
 from hal.base.transforms import inverse
@@ -102,6 +103,7 @@ def test_bad_clouds_and_single_members_are_rejected():
         UnionSampler([RowGenerator(0.0)], ScoreByX())
 
 
+@pytest.mark.integration
 def test_sweep_and_diffusion_together_hold_no_worse_than_the_sweep_alone():
     union = make_generator("union:obb_sweep+diffusion")
     assert isinstance(union, UnionSampler)
@@ -117,8 +119,8 @@ def test_sweep_and_diffusion_together_hold_no_worse_than_the_sweep_alone():
             grasps = generator.sample(points, 150, 0)
             T = inverse(T_camera_object) @ grasps.T_camera_grasps
             valid.append(check_grasps(solid, T, GRIPPERS["agnostic"]).valid.mean())
-        again = union.sample(points, 150, 0)
-        np.testing.assert_array_equal(again.T_camera_grasps, union.sample(points, 150, 0).T_camera_grasps)
+    again, once_more = (union.sample(points, 50, 0) for _ in range(2))
+    np.testing.assert_array_equal(again.T_camera_grasps, once_more.T_camera_grasps)
     assert np.mean(joined) >= np.mean(alone)
 
 

@@ -60,6 +60,7 @@ def test_broken_check_becomes_a_row() -> None:
     assert "inside the check" in row.found
 
 
+@pytest.mark.integration
 def test_every_check_answers_on_this_machine() -> None:
     for row in doctor.run_checks([*doctor.REQUIRED, *doctor.OPTIONAL]):
         assert "check itself failed" not in row.found, row
@@ -79,6 +80,7 @@ def test_port_taken_by_another_program_prevents_the_demo(monkeypatch: pytest.Mon
     assert "./z1 demo --port" in row.fix
 
 
+@pytest.mark.integration
 def test_port_taken_by_our_own_hal_is_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))

@@ -26,6 +26,7 @@ def searched(monkeypatch):
     return count
 
 
+@pytest.mark.integration
 def test_a_search_is_kept_and_gone_on_with(searched, tmp_path, capsys):
     place = {"objects": ("box",), "pitches": (0.0,), "distances": ("mid",), "laterals": ("left",)}
     config = Config(**place, executions=2, jobs=1, out=tmp_path)

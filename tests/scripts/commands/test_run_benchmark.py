@@ -25,6 +25,7 @@ def short(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
 
 
+@pytest.mark.integration
 def test_a_run_of_a_users_mesh_writes_all_that_it_says(short, tmp_path, capsys):
     trimesh.creation.cylinder(28.0, height=120.0, sections=24).export(tmp_path / "tin.stl")
     out = tmp_path / "out"
@@ -50,6 +51,7 @@ def test_a_run_of_a_users_mesh_writes_all_that_it_says(short, tmp_path, capsys):
     assert recording.stat().st_mtime_ns == before
 
 
+@pytest.mark.integration
 def test_an_exception_in_an_episode_is_counted_and_sets_the_exit_code(short, tmp_path, monkeypatch, capsys):
     def execute(*_):
         raise InjectedError("the gripper is beyond its limit")

@@ -59,6 +59,7 @@ def twin(lifts):
     return run_tasks
 
 
+@pytest.mark.integration
 def test_fitted_values_that_win_are_written_and_loaded_by_the_runtime(log, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(runner, "run_tasks", twin(lambda method, n: method.k == 3 or n % 3 == 0))
     out = tmp_path / "tune"

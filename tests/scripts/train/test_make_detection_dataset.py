@@ -64,6 +64,7 @@ def test_splits_share_no_seed_and_have_the_requested_sizes() -> None:
     assert all(b - a > 100_000 for a, b in pairwise(sorted(SPLITS.values())))
 
 
+@pytest.mark.integration
 def test_a_second_run_makes_only_missing_shards(tmp_path: Path) -> None:
     try:
         open_egl(16, 16).free()

@@ -34,6 +34,7 @@ def _start(end: Connection) -> None:
     child.join()
 
 
+@pytest.mark.integration
 def test_its_processes_end_when_their_parent_is_killed() -> None:
     here, there = _SPAWN.Pipe(duplex=False)
     parent = _SPAWN.Process(target=_start, args=(there,))

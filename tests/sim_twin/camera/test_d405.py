@@ -78,6 +78,7 @@ def test_a_near_thing_casts_its_shadow_to_its_left() -> None:
     assert (depth[210:290, 300 - 2 * shadow : 300 - shadow - 2] > 0).mean() > 0.95
 
 
+@pytest.mark.integration
 def test_surfaces_seen_at_a_grazing_angle_are_not_measured() -> None:
     columns = np.arange(INTRINSICS.width, dtype=np.float32)
     z = np.broadcast_to(0.2 + 0.012 * np.maximum(columns - 400.0, 0.0), SHAPE).astype(np.float32)

@@ -11,6 +11,7 @@ from tests.support.gl_here import needs_egl
 SIZE = (320, 180)
 
 
+@pytest.mark.integration
 @needs_egl
 def test_the_outside_view_by_gl_and_by_rays_shows_the_same_scene(world: World) -> None:
     egl, rays = (render_external(world.model, world.snapshot(), *SIZE, kind).astype(float) for kind in ("egl", "rays"))
@@ -21,6 +22,7 @@ def test_the_outside_view_by_gl_and_by_rays_shows_the_same_scene(world: World) -
     assert (blue[0] & blue[1]).sum() / (blue[0] | blue[1]).sum() > 0.85
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("kind", [pytest.param("egl", marks=needs_egl), "rays"])
 def test_a_picture_is_drawn_from_the_positions_alone(world: World, kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("Z1_TWIN_RENDER", kind)

@@ -20,6 +20,7 @@ def _draw(config: SceneConfig, kind: str) -> View:
     return view
 
 
+@pytest.mark.integration
 @needs_egl
 @pytest.mark.parametrize("name", PAPER_OBJECTS)
 def test_rays_and_egl_see_the_same_depth_and_the_same_object(name: str) -> None:
@@ -48,6 +49,7 @@ def test_the_table_is_where_the_pinhole_and_the_mount_say() -> None:
     np.testing.assert_allclose(height, 0.0, atol=2e-4)
 
 
+@pytest.mark.integration
 @needs_egl
 @pytest.mark.parametrize("name", PAPER_OBJECTS)
 def test_from_home_every_object_is_seen_past_the_open_jaws_and_beyond_min_z(name: str) -> None:

@@ -143,6 +143,7 @@ def test_a_value_that_is_not_finite_is_rejected_and_moves_nothing(board: MotorBo
     assert "must be finite" in board.invalid_reason
 
 
+@pytest.mark.integration
 def test_random_bytes_are_counted_and_never_crash(board: MotorBoard) -> None:
     rng = np.random.default_rng(3)
     good = command(START, np.zeros(7))

@@ -40,6 +40,7 @@ def renderer() -> Iterator[SceneRenderer]:
     made.close()
 
 
+@pytest.mark.integration
 @needs_egl
 def test_the_same_seed_gives_the_same_picture_and_another_seed_another(renderer: SceneRenderer) -> None:
     first, again, other = (draw_scene(renderer, np.random.default_rng(seed)) for seed in (3, 3, 4))
@@ -49,10 +50,11 @@ def test_the_same_seed_gives_the_same_picture_and_another_seed_another(renderer:
     assert not np.array_equal(first.colour, other.colour)
 
 
+@pytest.mark.integration
 @needs_egl
 def test_labels_are_of_the_three_classes_large_enough_and_apart(renderer: SceneRenderer) -> None:
     seen = 0
-    for seed in range(12):
+    for seed in range(6):
         picture = draw_scene(renderer, np.random.default_rng(seed), SceneMix(empty=0.0))
         assert picture.colour.shape == (INTRINSICS.height, INTRINSICS.width, 3)
         for label in picture.labels:
@@ -67,7 +69,7 @@ def test_labels_are_of_the_three_classes_large_enough_and_apart(renderer: SceneR
         stacked = sum(label.mask.astype(int) for label in picture.labels)
         assert np.max(stacked) <= 1
         seen += len(picture.labels)
-    assert seen >= 6
+    assert seen >= 3
 
 
 @needs_egl
@@ -76,6 +78,7 @@ def test_an_empty_scene_has_no_labels(renderer: SceneRenderer) -> None:
         assert draw_scene(renderer, np.random.default_rng(seed), SceneMix(empty=1.0)).labels == ()
 
 
+@pytest.mark.integration
 @needs_egl
 @pytest.mark.parametrize("name", CLASSES)
 def test_a_scenario_has_the_mask_that_the_twin_has(renderer: SceneRenderer, name: str) -> None:
@@ -95,6 +98,7 @@ def test_a_scenario_has_the_mask_that_the_twin_has(renderer: SceneRenderer, name
     assert (ours & twin).sum() / (ours | twin).sum() > 0.99
 
 
+@pytest.mark.integration
 @needs_egl
 @pytest.mark.parametrize("appearance", get_args(Appearance))
 def test_an_object_has_its_own_colours_unless_any_will_do(renderer: SceneRenderer, appearance: Appearance) -> None:
@@ -133,9 +137,10 @@ def test_what_an_occluder_covers_belongs_to_no_label_and_what_hardly_shows_is_ta
     assert not (renderer.draw_instances("wrist", "pieces") == renderer.props.index(cylinder)).any()
 
 
+@pytest.mark.integration
 @needs_egl
 def test_every_label_shows_enough_of_its_outline(renderer: SceneRenderer) -> None:
-    for seed in range(20, 32):
+    for seed in range(20, 26):
         picture = draw_scene(renderer, np.random.default_rng(seed), SceneMix(empty=0.0, wrist=0.0, occluded=1.0))
         camera = renderer.T_base_camera("free")
         for label in picture.labels:
@@ -148,11 +153,12 @@ def test_every_label_shows_enough_of_its_outline(renderer: SceneRenderer) -> Non
             assert label.mask.sum() >= min(MIN_VISIBLE_RATIO * min(areas), 0.08 * label.mask.size)
 
 
+@pytest.mark.integration
 @needs_egl
 def test_a_bottle_without_its_neck_has_no_label_where_colours_tell_nothing(renderer: SceneRenderer) -> None:
     """Its shoulder cut off by the picture's border, a bottle in random colours is a cylinder."""
     seen = {True: 0, False: 0}
-    for seed in range(40, 100):
+    for seed in range(40, 70):
         rng = np.random.default_rng(seed)
         picture = draw_scene(renderer, rng, SceneMix(empty=0.0, twin=0.0, own=0.0, wrist=0.0, occluded=0.0))
         camera = renderer.T_base_camera("free")
@@ -164,7 +170,7 @@ def test_a_bottle_without_its_neck_has_no_label_where_colours_tell_nothing(rende
             neck = project_outline(corners, camera, renderer.intrinsics)
             assert neck is not None
             seen[visible_ratio(mask, neck) >= MIN_MARK_RATIO] += 1
-    assert seen[True] >= 5
+    assert seen[True] >= 3
     assert seen[False] == 0
 
 
@@ -224,11 +230,12 @@ def test_a_photograph_is_noisy_in_every_channel_and_brought_to_a_fair_exposure()
     assert (np.median(noise, axis=0) > 1.0).all()
 
 
+@pytest.mark.integration
 @needs_egl
 def test_a_crowd_shows_more_objects(renderer: SceneRenderer) -> None:
     def shown(crowd: float) -> list[int]:
         mix = SceneMix(empty=0.0, twin=0.0, own=0.0, crowd=crowd)
-        return [len(draw_scene(renderer, np.random.default_rng([5, n]), mix).labels) for n in range(8)]
+        return [len(draw_scene(renderer, np.random.default_rng([5, n]), mix).labels) for n in range(5)]
 
     few, many = shown(0.0), shown(1.0)
     assert max(few) <= 3
@@ -236,12 +243,13 @@ def test_a_crowd_shows_more_objects(renderer: SceneRenderer) -> None:
     assert max(many) > 3
 
 
+@pytest.mark.integration
 @needs_egl
 def test_the_number_of_distractors_can_be_raised(renderer: SceneRenderer) -> None:
     def shown(distractors: float) -> int:
         mix = SceneMix(crowd=0.5, occluded=0.0, distractors=distractors)
         counts = []
-        for n in range(8):
+        for n in range(4):
             draw_scene(renderer, np.random.default_rng([6, n]), mix)
             counts.append(sum(renderer.is_shown(instance) for instance in renderer.distractors()))
         return sum(counts)
@@ -251,11 +259,12 @@ def test_the_number_of_distractors_can_be_raised(renderer: SceneRenderer) -> Non
     assert 0 < some < many
 
 
+@pytest.mark.integration
 @needs_egl
 def test_every_mug_shows_its_handle(renderer: SceneRenderer) -> None:
     """Without it a mug is a cylinder, which a picture must not show without a label."""
     seen = 0
-    for seed in range(200, 260):
+    for seed in range(200, 245):
         draw_scene(renderer, np.random.default_rng(seed), SceneMix(empty=1.0, wrist=0.0))
         for mug in renderer.distractors():
             if mug.prop.kind != "mug" or not renderer.is_shown(mug):

@@ -66,6 +66,7 @@ def measure_shifts(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, n
     return corners.reshape(-1, 2)[valid], (tracked - corners).reshape(-1, 2)[valid]
 
 
+@pytest.mark.integration
 def test_depth_equals_the_exact_rendering_of_its_pinhole(patchwork: World) -> None:
     with TwinSource(patchwork) as source:
         depth = expose(source, depth=True).depth
@@ -78,6 +79,7 @@ def test_depth_equals_the_exact_rendering_of_its_pinhole(patchwork: World) -> No
     assert np.percentile(error_m, 99.5) < 2 * DEPTH_UNIT_M
 
 
+@pytest.mark.integration
 @needs_egl
 @needs_librealsense
 def test_the_driver_undistorts_colour_onto_depth_to_a_fraction_of_a_pixel(patchwork: World) -> None:
@@ -126,6 +128,7 @@ def test_every_stream_is_within_the_wide_image(size: tuple[int, int], source: Tw
     assert optics.wide.width < 1.1 * size[0]
 
 
+@pytest.mark.integration
 def test_no_depth_below_the_min_z_of_the_resolution(source: TwinSource) -> None:
     exact_m = render_exact(source.world, source.calibration.depth(1280, 720)).z_m
     assert 0.0 < exact_m[exact_m > 0].min() < MIN_Z_M[1280, 720]
@@ -141,6 +144,7 @@ def test_the_left_edge_without_stereo_overlap_is_empty(source: TwinSource) -> No
     assert (depth[100:400, 100:500] > 0).mean() > 0.6
 
 
+@pytest.mark.integration
 def test_noise_differs_between_frames_and_is_reproducible(source: TwinSource) -> None:
     images = {"depth": True, "colour": True, "left": True}
     first, again, other = (expose(source, number=number, **images) for number in (1, 1, 2))
@@ -163,6 +167,7 @@ def test_only_requested_images_are_made(source: TwinSource) -> None:
     assert exposure.colour is exposure.left is exposure.right is None
 
 
+@pytest.mark.integration
 @needs_librealsense
 def test_the_same_world_gives_librealsense_the_same_frames() -> None:
     import hal.compat.realsense as rs

@@ -50,6 +50,7 @@ def view_from(world: World, distance_m: float, tilt_deg: float, kind: str) -> tu
     return d405.measure_colour(colour, seed=0, sequence=1), np.linalg.inv(T_board_camera)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("kind", RENDERERS)
 @pytest.mark.parametrize(("distance_m", "tilt_deg"), [(0.15, 0.0), (0.22, 35.0), (0.30, 50.0), (0.40, 40.0)])
 def test_corners_are_detected_where_they_are_to_a_fraction_of_a_pixel(
@@ -96,6 +97,7 @@ def test_a_mount_off_its_drawing_is_off_by_what_was_asked_and_has_a_serial_of_it
     assert len(serials | {SceneConfig().camera_serial()}) == 4
 
 
+@pytest.mark.integration
 @needs_egl
 def test_every_frame_has_the_camera_s_serial_number():
     config = SceneConfig(mount_error_deg=1.0)

@@ -46,6 +46,7 @@ def _is_inside(corners: np.ndarray, point: np.ndarray) -> bool:
     return bool((equations[:, :3] @ point + equations[:, 3] < 0).all())
 
 
+@pytest.mark.integration
 def test_it_rests_in_the_scene_on_its_lowest_point(tmp_path):
     name, grasp_object = load_mesh_object(write(tmp_path / "bracket.stl", bracket()), 1e-3, 0.15)
     for pitch_deg in (0.0, 45.0):
@@ -58,6 +59,7 @@ def test_it_rests_in_the_scene_on_its_lowest_point(tmp_path):
         assert world.fixture_holds == (pitch_deg != 0)
 
 
+@pytest.mark.integration
 def test_an_open_surface_is_taken_as_filled(tmp_path):
     tube = trimesh.creation.cylinder(0.03, height=0.08, sections=16)
     tube.update_faces(tube.face_normals[:, 2] < 0.9)
@@ -67,6 +69,7 @@ def test_an_open_surface_is_taken_as_filled(tmp_path):
     assert any(_is_inside(part.corners(), np.array([0.005, 0.0, 0.02])) for part in grasp_object.parts)
 
 
+@pytest.mark.integration
 def test_what_cannot_stand_is_held(tmp_path):
     ball = trimesh.creation.icosphere(subdivisions=3, radius=0.03)
     top = trimesh.creation.cone(radius=0.03, height=0.08, transform=np.diag([1.0, -1.0, -1.0, 1.0]))
@@ -133,6 +136,7 @@ def test_files_that_are_no_mesh_are_rejected(tmp_path):
         load_mesh_object(write(tmp_path / "flat.stl", flat), 1.0, 0.1)
 
 
+@pytest.mark.integration
 def test_what_has_a_round_bottom_does_not_stand_though_its_corners_make_feet(tmp_path):
     pill = trimesh.creation.capsule(height=60.0, radius=24.0)
     _, grasp_object = load_mesh_object(write(tmp_path / "pill.stl", pill), 1e-3, 0.2)

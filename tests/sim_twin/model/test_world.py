@@ -101,6 +101,7 @@ def _object_in_gripper(world: World) -> np.ndarray:
     return np.linalg.inv(T_base_gripper) @ world.T_base_object()
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("name", PAPER_OBJECTS)
 def test_a_held_object_is_lifted_and_neither_slips_nor_sinks_in(name: str) -> None:
     world = World(SceneConfig(object=name))
@@ -138,6 +139,7 @@ def _run_into_the_object(world: World) -> None:
     _move(world, start, goal, duration_s=2.0)
 
 
+@pytest.mark.integration
 def test_a_push_breaks_the_fixture_for_good() -> None:
     world = World(SceneConfig(object="bottle", pitch_deg=20.0, distance_m=0.45))
     _run_into_the_object(world)

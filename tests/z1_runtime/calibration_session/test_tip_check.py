@@ -31,6 +31,7 @@ def touch(kinematics: Kinematics, T_base_board: np.ndarray, **config) -> tuple[B
     return bench, list(test.run(T_base_board, checker))
 
 
+@pytest.mark.integration
 def test_the_tip_is_brought_over_corners_far_apart(kinematics):
     T_base_board = flat_board(0.495, 0.10)
     _, touches = touch(kinematics, T_base_board, n=4, height_m=0.005)

@@ -85,6 +85,7 @@ def test_the_jacobian_is_the_derivative_of_the_pivot(fraction: np.ndarray) -> No
     np.testing.assert_allclose(KINEMATICS.jacobian(q), np.transpose(numeric), atol=1e-7)
 
 
+@pytest.mark.integration
 @settings(max_examples=300)
 @given(FRACTIONS)
 def test_every_branch_reaches_the_pose_inside_the_limits(fraction: np.ndarray) -> None:

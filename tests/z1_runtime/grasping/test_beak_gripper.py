@@ -160,6 +160,7 @@ def test_the_mapping_moves_with_the_grasp():
         assert np.linalg.det(b.T_base_pivot[:3, :3]) == pytest.approx(1.0)
 
 
+@pytest.mark.integration
 @settings(max_examples=200)
 @given(st.floats(1e-4, 0.2), st.floats(-0.02, 0.12))
 def test_every_jaw_angle_is_inside_the_limits(width_m, front_m):

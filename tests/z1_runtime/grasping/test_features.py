@@ -105,6 +105,7 @@ def test_a_grasp_below_a_threshold_comes_last_but_is_kept(kinematics, observatio
     assert high > low > 2.0
 
 
+@pytest.mark.integration
 def test_a_selector_reads_the_file_that_its_configuration_names(tmp_path):
     def selector(config: RuntimeConfig) -> GraspSelector:
         return make_grasp_selector(replace(config, n_candidates=200))

@@ -111,6 +111,7 @@ def test_a_wrong_scoring_is_rejected_with_its_name(file: Path, change: dict, cod
     assert "scoring.yaml" in str(caught.value)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(
     "change",
     [

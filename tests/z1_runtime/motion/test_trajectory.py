@@ -53,6 +53,7 @@ def assert_sound(motion: JointTrajectory, limits: MotionLimits) -> None:
     np.testing.assert_allclose(np.diff(motion.q, axis=0) / dt, midpoint, atol=1e-3)
 
 
+@pytest.mark.integration
 @settings(max_examples=60)
 @given(FRACTIONS, FRACTIONS, SPEEDS)
 def test_a_joint_move_goes_straight_and_keeps_all_limits(start: np.ndarray, goal: np.ndarray, speed: float) -> None:
@@ -77,6 +78,7 @@ def test_a_joint_move_is_as_fast_as_its_slowest_limit() -> None:
     assert by_hand <= motion.duration_s <= by_hand + z1.CONTROL_PERIOD_S
 
 
+@pytest.mark.integration
 @settings(max_examples=40)
 @given(
     hnp.arrays(np.float64, 6, elements=st.floats(-0.2, 0.2)),
@@ -180,6 +182,7 @@ def test_moving_to_where_the_arm_is_takes_one_period() -> None:
     np.testing.assert_array_equal(motion.q, [Q_READY, Q_READY])
 
 
+@pytest.mark.integration
 @settings(max_examples=30)
 @given(FRACTIONS, FRACTIONS, st.sampled_from([0.02, 0.1, 0.2]))
 def test_the_parts_of_a_motion_cover_every_sample_once(start: np.ndarray, goal: np.ndarray, length_s: float) -> None:

@@ -43,6 +43,7 @@ def straight() -> tuple[RgbdFrame, float, np.ndarray]:
     return taken(SceneConfig(object="bottle"))
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("seed", [1, 3])
 def test_wrong_extrinsics_are_corrected_by_the_jaws_in_view(seed: int) -> None:
     scene = SceneConfig(object="bottle", mount_error_m=0.003, mount_error_deg=1.0, mount_seed=seed)
@@ -54,6 +55,7 @@ def test_wrong_extrinsics_are_corrected_by_the_jaws_in_view(seed: int) -> None:
     assert offset_m(seen.T_flange_camera, T_true) < min(0.0025, 0.6 * before)
 
 
+@pytest.mark.integration
 def test_right_extrinsics_stay(straight: tuple[RgbdFrame, float, np.ndarray]) -> None:
     frame, jaw, T_true = straight
     assert T_true == pytest.approx(z1.T_FLANGE_CAMERA, abs=1e-6)
@@ -77,6 +79,7 @@ def test_a_card_in_front_of_the_jaws_is_not_mistaken_for_them(straight: tuple[Rg
     assert CHECK.correct(card, gripper(card, jaw), jaw, z1.T_FLANGE_CAMERA) is None
 
 
+@pytest.mark.integration
 def test_perception_uses_the_corrected_extrinsics_and_warns_once(caplog: pytest.LogCaptureFixture) -> None:
     scene = SceneConfig(object="bottle", mount_error_m=0.003, mount_error_deg=1.0, mount_seed=3)
     frame, jaw, T_true = taken(scene)
@@ -91,6 +94,7 @@ def test_perception_uses_the_corrected_extrinsics_and_warns_once(caplog: pytest.
     assert caplog.text.count("calibrate the camera") == 1
 
 
+@pytest.mark.integration
 def test_it_can_be_switched_off() -> None:
     scene = SceneConfig(object="bottle", mount_error_m=0.003, mount_error_deg=1.0, mount_seed=1)
     frame, jaw, _ = taken(scene)

@@ -105,6 +105,7 @@ def test_the_box_filters_the_candidates_by_the_configuration(selector, selection
     assert len(one_face.ranked) < len(selection.ranked)
 
 
+@pytest.mark.integration
 def test_the_same_frame_and_seed_give_the_same_plan_bit_by_bit(selector, selection, T_base_camera):
     again = selector.select(draw_can(T_base_camera), Q)
     assert again.ranked.indices.tolist() == selection.ranked.indices.tolist()
@@ -174,6 +175,7 @@ def test_candidates_that_all_come_from_behind_leave_no_plan(selector, selection,
     assert "none of 300 candidates approaches one of the 2 nearest faces" in str(caught.value)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("detector", ["yolo", "tabletop", "ground_truth"])
 def test_warming_up_needs_no_camera_with_any_detector(detector, caplog):
     with caplog.at_level("INFO", "z1_runtime.factory"):
@@ -181,12 +183,14 @@ def test_warming_up_needs_no_camera_with_any_detector(detector, caplog):
     assert not caplog.records
 
 
+@pytest.mark.integration
 def test_warming_up_reads_the_jaws_meshes_though_no_jaws_are_drawn(selector):
     extrinsics._sample_mesh.cache_clear()
     warm_up_selector(selector)
     assert extrinsics._sample_mesh.cache_info().currsize == 2
 
 
+@pytest.mark.integration
 def test_a_warm_up_scene_without_a_plan_is_logged_and_a_real_one_is_an_error(T_base_camera, caplog):
     config = RuntimeConfig(detector="tabletop", generator="antipodal")
     high = make_grasp_selector(replace(config, planner=replace(config.planner, lift_m=0.5)))
@@ -197,6 +201,7 @@ def test_a_warm_up_scene_without_a_plan_is_logged_and_a_real_one_is_an_error(T_b
         high.select(draw_can(T_base_camera), np.append(z1.Q_HOME, -1.0))
 
 
+@pytest.mark.integration
 def test_every_stage_can_be_called_alone_and_none_is_entered_twice(selector, selection, T_base_camera, monkeypatch):
     calls = []
     for name in ("observe", "generate", "filter", "build_scene", "rank"):

@@ -79,6 +79,7 @@ def can(selector) -> RgbdFrame:
     return draw_can(selector.kinematics.flange(z1.Q_HOME) @ z1.T_FLANGE_CAMERA)
 
 
+@pytest.mark.integration
 def test_a_pick_goes_through_its_phases_and_ends_where_the_plan_does(selector, can):
     cell = Cell(selector, can)
     result = cell.pipeline.pick()
@@ -90,12 +91,14 @@ def test_a_pick_goes_through_its_phases_and_ends_where_the_plan_does(selector, c
     assert result.stage_ms["total"] > 0.0
 
 
+@pytest.mark.integration
 def test_jaws_that_close_on_nothing_hold_nothing(selector, can):
     result = Cell(selector, can).pipeline.pick()
     assert not result.held
     assert result.jaw == pytest.approx(0.0, abs=1e-3)
 
 
+@pytest.mark.integration
 def test_jaws_that_something_keeps_open_hold_it(selector, can):
     cell = Cell(selector, can)
     cell.after = lambda name: cell.bench.mock.block(z1.N_ARM) if name == "approach" else None
@@ -105,6 +108,7 @@ def test_jaws_that_something_keeps_open_hold_it(selector, can):
     assert abs(result.jaw_torque_nm) > CONFIG.held_torque_nm
 
 
+@pytest.mark.integration
 def test_the_arm_goes_home_first_and_a_second_pick_starts_from_where_the_first_ended(selector, can):
     cell = Cell(selector, can, Q_LOOK + np.array([0.3, 0.2, -0.2, 0.1, 0.0, -0.3, 0.5]))
     captured_from = []
@@ -116,6 +120,7 @@ def test_the_arm_goes_home_first_and_a_second_pick_starts_from_where_the_first_e
     assert second.selection.plan.rank == first.selection.plan.rank
 
 
+@pytest.mark.integration
 def test_a_miss_is_followed_by_another_frame_and_pick_up_to_the_attempts(selector, can):
     cell = Cell(selector, can)
     result = cell.pipeline.pick_until_held()
@@ -123,6 +128,7 @@ def test_a_miss_is_followed_by_another_frame_and_pick_up_to_the_attempts(selecto
     assert cell.ended == PHASES * CONFIG.attempts
 
 
+@pytest.mark.integration
 def test_a_pick_that_holds_is_not_repeated(selector, can):
     cell = Cell(selector, can)
     cell.after = lambda name: cell.bench.mock.block(z1.N_ARM) if name == "approach" else None
@@ -150,6 +156,7 @@ def test_a_pick_that_may_drop_opens_the_jaws(selector, can):
     assert cell.ended == PHASES * 2
 
 
+@pytest.mark.integration
 def test_an_object_that_a_miss_pushed_away_ends_the_attempts(selector, can):
     cell = Cell(selector, can)
     empty = replace(can, depth_m=np.where(can.depth_m < 0.45, 0.0, can.depth_m))
@@ -206,6 +213,7 @@ def test_a_camera_that_shows_nothing_is_an_error_and_nothing_moves(selector, can
     assert nothing_moved(cell)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("phase", ["transfer", "approach", "lift"])
 def test_a_stop_in_any_motion_ends_the_pick_with_its_reason_and_the_arm_rests(selector, can, phase):
     cell = Cell(selector, can)
@@ -226,6 +234,7 @@ def test_a_stop_in_any_motion_ends_the_pick_with_its_reason_and_the_arm_rests(se
         cell.pipeline.pick()
 
 
+@pytest.mark.integration
 def test_after_a_stop_and_rearming_the_next_pick_works(selector, can):
     cell = Cell(selector, can)
     cell.after = lambda name: cell.bench.servo.stop("red button") if name == "approach" else None

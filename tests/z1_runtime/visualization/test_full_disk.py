@@ -37,6 +37,7 @@ def noisy_frame(n: int) -> RgbdFrame:
     )
 
 
+@pytest.mark.integration
 @pytest.mark.faults
 @pytest.mark.usefixtures("limited_file_size")
 def test_a_disk_that_fills_up_ends_the_recording_and_not_the_pick(

@@ -68,6 +68,7 @@ def test_pinhole_of_depth_and_serial_of_the_device(camera: D405Camera) -> None:
     assert camera.wait_for_frame(1.0).serial == rs.SERIAL
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("size", list(d405.MIN_Z_M))
 def test_colour_shows_the_same_as_depth_pixel_by_pixel(size: tuple[int, int]) -> None:
     camera = D405Camera(replace(SMALL, width=size[0], height=size[1]), source=PlainSource())
@@ -226,6 +227,7 @@ def test_a_jump_of_the_systems_time_does_not_stop_it(
     assert camera.health.resets == 0
 
 
+@pytest.mark.integration
 def test_a_camera_without_frames_cannot_be_connected_and_is_closed(source: PlainSource) -> None:
     source.hangs = True
     camera = D405Camera(SMALL, source=source)

@@ -187,6 +187,7 @@ def test_a_client_that_ends_in_motion_leaves_an_arm_that_holds(bench: Bench) -> 
     assert np.abs(bench.peer.q - at_end)[0] < 0.05
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("mode", [Z1Mode.TRACKING, Z1Mode.LOW_LEVEL])
 def test_no_joint_is_commanded_beyond_its_limits(mode: Z1Mode) -> None:
     bench = make_bench(mode)
@@ -493,6 +494,7 @@ def test_one_outlier_answer_is_dropped_and_a_second_accepted(bench: Bench) -> No
     assert abs(bench.arm.read_state().q[0] - q[0]) > 0.5
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("mode", [Z1Mode.TRACKING, Z1Mode.LOW_LEVEL])
 def test_the_arm_follows_over_a_bad_network(mode: Z1Mode) -> None:
     """A tenth of all datagrams lost, doubled, late, cut, too long, changed or random."""
@@ -512,6 +514,7 @@ def test_the_arm_follows_over_a_bad_network(mode: Z1Mode) -> None:
     assert all(fault.startswith("joint") for fault in bench.arm.read_state().faults)
 
 
+@pytest.mark.integration
 def test_a_hostile_network_raises_only_known_errors() -> None:
     """Every datagram is mangled; only a timeout or a rejection may be raised."""
     bench = make_bench()
@@ -557,6 +560,7 @@ def test_a_trajectory_is_executed_to_its_end() -> None:
     assert bench.peer.q[0] == pytest.approx(1.0, abs=0.01)
 
 
+@pytest.mark.integration
 def test_a_motor_fault_latches_the_servo_during_the_motion() -> None:
     bench = make_bench()
     servo = play(bench, lambda: bench.peer.error.__setitem__((2, 0), MotorError.OVERHEAT))

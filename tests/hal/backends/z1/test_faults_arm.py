@@ -16,6 +16,7 @@ from tests.support.hal.wire_bench import WireBench
 pytestmark = pytest.mark.faults
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(
     ("motor", "field", "value"),
     [
@@ -38,6 +39,7 @@ def test_a_motors_fault_bit(
     bench.report(faults_table, f"motor {field} bit {value.name.lower().replace('_', ' ')}")
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("mode", [Z1Mode.TRACKING, Z1Mode.LOW_LEVEL])
 def test_a_motor_board_that_falls_silent(mode: Z1Mode, faults_table: FaultsTable) -> None:
     bench = WireBench(mode)
@@ -49,6 +51,7 @@ def test_a_motor_board_that_falls_silent(mode: Z1Mode, faults_table: FaultsTable
     bench.report(faults_table, f"motor board silent ({mode})")
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("mode", [Z1Mode.TRACKING, Z1Mode.LOW_LEVEL])
 def test_a_controller_without_answers(mode: Z1Mode, faults_table: FaultsTable) -> None:
     bench = WireBench(mode)
@@ -59,6 +62,7 @@ def test_a_controller_without_answers(mode: Z1Mode, faults_table: FaultsTable) -
     bench.report(faults_table, f"controller ended, or its cable unplugged ({mode})")
 
 
+@pytest.mark.integration
 def test_a_controller_switched_by_another_program(faults_table: FaultsTable) -> None:
     bench = WireBench()
     bench.play(lambda: bench.twin.receive(encode_command(Fsm.CARTESIAN)))
@@ -68,6 +72,7 @@ def test_a_controller_switched_by_another_program(faults_table: FaultsTable) -> 
     bench.report(faults_table, "controller switched by another program")
 
 
+@pytest.mark.integration
 def test_a_clock_that_jumps(faults_table: FaultsTable) -> None:
     bench = WireBench()
     bench.play(lambda: setattr(bench.clock, "ahead_s", 3600.0))
@@ -76,6 +81,7 @@ def test_a_clock_that_jumps(faults_table: FaultsTable) -> None:
     bench.report(faults_table, "clock jumps by 1 h, as after a suspend")
 
 
+@pytest.mark.integration
 def test_a_push_that_is_stronger_than_a_motor(faults_table: FaultsTable) -> None:
     push_nm, push_s = 33.0, 0.3
     bench = WireBench()

@@ -17,6 +17,7 @@ pytestmark = pytest.mark.faults
 FUZZ = 100_000
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("fate", FATES)
 def test_a_tenth_of_all_datagrams(fate: str, faults_table: FaultsTable) -> None:
     bench = WireBench()
@@ -28,6 +29,7 @@ def test_a_tenth_of_all_datagrams(fate: str, faults_table: FaultsTable) -> None:
     bench.report(faults_table, f"10 % of all datagrams {fate}")
 
 
+@pytest.mark.integration
 def test_random_datagrams(faults_table: FaultsTable) -> None:
     """Half of them to the driver, with the right head as well; half to the controller, which would obey that head."""
     bench = WireBench(Z1Mode.LOW_LEVEL)

@@ -477,6 +477,7 @@ def test_an_unplugged_twin_does_not_return(source: PlainSource) -> None:
 # --- Recordings ---------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.integration
 def test_a_recording_replays_the_recorded_frames(twin: rs.TwinDevice, tmp_path: Path) -> None:
     file = str(tmp_path / "wall.db3")
     config = make_config()

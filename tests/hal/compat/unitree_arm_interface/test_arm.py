@@ -123,6 +123,7 @@ def test_moves_reach_their_goals_with_and_without_the_gripper(arm: ArmInterface,
         arm.MoveJ(np.zeros(6))
 
 
+@pytest.mark.integration
 def test_without_waiting_a_move_is_only_started(arm: ArmInterface, peer: FakeController, clock: ManualClock) -> None:
     arm.setWait(False)
     arm.labelRun("forward")
@@ -135,6 +136,7 @@ def test_without_waiting_a_move_is_only_started(arm: ArmInterface, peer: FakeCon
     assert peer.q[:6] == pytest.approx(LABELS["startFlat"], abs=0.01)
 
 
+@pytest.mark.integration
 def test_joints_are_jogged(arm: ArmInterface, peer: FakeController, clock: ManualClock) -> None:
     arm.labelRun("forward")
     arm.startTrack(ArmFSMState.JOINTCTRL)
@@ -149,6 +151,7 @@ def test_joints_are_jogged(arm: ArmInterface, peer: FakeController, clock: Manua
     assert peer.q[3] == pytest.approx(z1.Q_MIN[3], abs=1e-3)
 
 
+@pytest.mark.integration
 def test_a_far_target_is_approached_at_the_maximum_speed(
     arm: ArmInterface, peer: FakeController, clock: ManualClock
 ) -> None:
@@ -163,6 +166,7 @@ def test_a_far_target_is_approached_at_the_maximum_speed(
     assert peer.q[6] == pytest.approx(z1.Q_MIN[6], abs=1e-3)
 
 
+@pytest.mark.integration
 def test_the_posture_is_jogged_and_stops_without_commands(
     arm: ArmInterface, peer: FakeController, clock: ManualClock
 ) -> None:

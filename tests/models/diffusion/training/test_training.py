@@ -17,6 +17,7 @@ from models.diffusion.training.training import (
 GRIPPER = GRIPPERS["agnostic"]
 
 
+@pytest.mark.integration
 def test_training_lowers_the_loss_and_resumes(data, tmp_path):
     torch.set_num_threads(1)
     config = TrainingConfig(generator_iterations=15, views_per_batch=4, grasps_per_view=24)
@@ -42,6 +43,7 @@ def label(generator: Denoiser, data, folder, **settings) -> LabelledSamples:
     )
 
 
+@pytest.mark.integration
 def test_labelled_samples_are_cached_for_their_generator(data, tmp_path, monkeypatch):
     first, other = Denoiser().eval(), Denoiser().eval()
     labelled = label(first, data, tmp_path)
@@ -52,6 +54,7 @@ def test_labelled_samples_are_cached_for_their_generator(data, tmp_path, monkeyp
     assert not torch.equal(labelled.grasps[:, :24], label(other, data, tmp_path).grasps[:, :24])
 
 
+@pytest.mark.integration
 def test_a_grasp_lost_in_simulation_counts_as_invalid(data, tmp_path, monkeypatch):
     generator = Denoiser().eval()
     without_simulation = label(generator, data, tmp_path / "none", simulated_fraction=0.0)
@@ -64,6 +67,7 @@ def test_a_grasp_lost_in_simulation_counts_as_invalid(data, tmp_path, monkeypatc
     assert without_simulation.simulated == without_simulation.lost == 0
 
 
+@pytest.mark.integration
 def test_calibration_corrects_an_overconfident_discriminator(data, tmp_path):
     generator = Denoiser().eval()
     labelled = label(generator, data, tmp_path, simulated_fraction=0.0)
@@ -79,6 +83,7 @@ def test_calibration_corrects_an_overconfident_discriminator(data, tmp_path):
     assert (scale, offset) != (1.0, 0.0)
 
 
+@pytest.mark.integration
 def test_the_discriminator_learns_from_labelled_samples(data, tmp_path):
     torch.set_num_threads(1)
     config = TrainingConfig(discriminator_iterations=12)

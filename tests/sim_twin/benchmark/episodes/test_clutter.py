@@ -67,6 +67,7 @@ def test_neighbours_stand_and_one_that_is_pushed_over_is_counted():
     np.testing.assert_allclose(world.T_base_object()[:3, 3], CLUTTERED.scene().T_base_object()[:3, 3], atol=2e-3)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("lateral", ["left", "right"])
 def test_a_detector_without_classes_is_pointed_at_the_object(lateral):
     scenario = replace(CLUTTERED, lateral=lateral)

@@ -23,6 +23,7 @@ def selector():
     return make_grasp_selector(CONFIG)
 
 
+@pytest.mark.integration
 def test_an_exception_becomes_the_row_of_its_method_alone(selector, monkeypatch):
     def run_method(_, method, *__, **___):
         if method.name == "mvb":

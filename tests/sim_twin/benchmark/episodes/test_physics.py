@@ -30,6 +30,7 @@ def test_what_is_drawn_fills_its_range():
         assert high - 0.1 * (high - low) < values.max() <= high
 
 
+@pytest.mark.integration
 def test_the_world_is_as_drawn_and_the_row_says_so():
     scene, row = NOISY.scene(), NOISY.columns()
     usual = World(SceneConfig(object="box", lateral_m=0.15)).model

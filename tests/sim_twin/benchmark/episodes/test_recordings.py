@@ -27,6 +27,7 @@ def entities(path):
     return {chunk.entity_path.strip("/") for chunk in RrdReader(path).stream().to_chunks()}
 
 
+@pytest.mark.integration
 def test_a_failure_is_recorded_with_what_was_seen_and_ranked(selector, tmp_path, monkeypatch):
     at_the_lens = GraspSet(T_camera_grasps=np.tile(np.eye(4), (3, 1, 1)), scores=np.ones(3), widths_m=np.full(3, 0.04))
     monkeypatch.setattr(type(selector), "generate", lambda self, observation: at_the_lens)
@@ -39,6 +40,7 @@ def test_a_failure_is_recorded_with_what_was_seen_and_ranked(selector, tmp_path,
     assert blueprint.GRASP not in entities(path)
 
 
+@pytest.mark.integration
 def test_a_chosen_episode_is_recorded_with_its_box_and_plan(selector, tmp_path):
     path = record_scenario(SCENARIO, METHODS_OF_OURS["mvb"], lambda *_: selector, tmp_path)
     assert path == tmp_path / f"{SCENARIO.key}-mvb.rrd"
@@ -51,6 +53,7 @@ def test_a_success_is_recorded_only_with_all_others(tmp_path):
     assert Recordings(folder=tmp_path, choice="all").wants(success=True)
 
 
+@pytest.mark.integration
 def test_what_saw_nothing_is_not_recorded(selector, tmp_path):
     hidden = replace(SCENARIO, occlusion=0.99)
     assert record_scenario(hidden, METHODS_OF_OURS["mvb"], lambda *_: selector, tmp_path) is None

@@ -42,6 +42,7 @@ class Grasped:
         monkeypatch.setattr(EpisodeRobot, "execute", execute)
 
 
+@pytest.mark.integration
 def test_after_a_miss_the_object_is_found_where_it_then_is(selector, monkeypatch):
     grasped = Grasped(monkeypatch, missing=1)
     (row,) = run_scenario(SCENARIO, [MVB], lambda *_: selector, top_k=3)
@@ -53,6 +54,7 @@ def test_after_a_miss_the_object_is_found_where_it_then_is(selector, monkeypatch
     np.testing.assert_allclose(grasped.starts[1], [*z1.Q_HOME, selector.config.jaw_home], atol=5e-3)
 
 
+@pytest.mark.integration
 def test_there_are_no_more_attempts_than_asked_for(selector, monkeypatch):
     grasped = Grasped(monkeypatch, missing=9)
     (row,) = run_scenario(SCENARIO, [MVB], lambda *_: selector, top_k=1)
@@ -61,6 +63,7 @@ def test_there_are_no_more_attempts_than_asked_for(selector, monkeypatch):
     assert row["given_up"] == ""
 
 
+@pytest.mark.integration
 def test_each_attempt_has_candidates_of_its_own_and_the_row_is_of_the_last(selector, monkeypatch):
     seeds = []
 
@@ -77,6 +80,7 @@ def test_each_attempt_has_candidates_of_its_own_and_the_row_is_of_the_last(selec
     assert len(set(seeds)) == 3
 
 
+@pytest.mark.integration
 def test_an_object_that_has_gone_ends_the_episode_with_the_reason(selector, monkeypatch):
     monkeypatch.setattr(EpisodeRobot, "execute", lambda *_: Outcome(mode=Mode.KNOCKED))
     real = episode.occlude
@@ -92,6 +96,7 @@ def test_an_object_that_has_gone_ends_the_episode_with_the_reason(selector, monk
     assert row["given_up"].startswith("no detection: ")
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("mode", [Mode.TABLE_COLLISION, Mode.STOPPED])
 def test_what_would_stop_a_real_arm_is_not_tried_again(selector, monkeypatch, mode):
     monkeypatch.setattr(EpisodeRobot, "execute", lambda *_: Outcome(mode=mode))
@@ -99,6 +104,7 @@ def test_what_would_stop_a_real_arm_is_not_tried_again(selector, monkeypatch, mo
     assert (row["attempts"], row["modes"]) == (1, [mode.value])
 
 
+@pytest.mark.integration
 def test_what_slipped_but_hangs_is_put_down_before_the_jaws_open(selector):
     frame, q = capture(SCENARIO.scene())
     plan = selector.select(frame, q).plan

@@ -96,6 +96,7 @@ def test_a_finer_sweep_remembers_what_failed(find_grasps):
     assert not np.allclose(following.placement.T_base_pivot, best.placement.T_base_pivot)
 
 
+@pytest.mark.integration
 def test_an_upright_box_is_lifted_by_the_first_grasp():
     row = search(BOX, OracleConfig(sweep=FEW))
     assert row["success"]
@@ -118,6 +119,7 @@ def test_what_is_too_wide_on_all_sides_is_unreachable():
     assert row["executions"] == row["n_reachable"] == 0
 
 
+@pytest.mark.integration
 def test_where_all_fails_the_budget_is_spent_on_grasps_that_differ(monkeypatch):
     plans = []
 
@@ -137,6 +139,7 @@ def test_where_all_fails_the_budget_is_spent_on_grasps_that_differ(monkeypatch):
         assert (10.0 * moved + turned).min() > 0.3
 
 
+@pytest.mark.integration
 def test_a_search_says_the_same_each_time(monkeypatch):
     monkeypatch.setattr(EpisodeRobot, "execute", lambda *_: Outcome(mode=Mode.DROPPED))
     config = OracleConfig(sweep=FEW, executions=2)

@@ -34,15 +34,19 @@ def write(path, rows, **more):
     return path.read_text()
 
 
-@pytest.fixture
-def page(tmp_path):
-    return write(tmp_path / "report.html", make_rows(("vanilla", "mvb", "full"), occlusions=(0.0, 0.25)))
+@pytest.fixture(scope="module")
+def page(tmp_path_factory):
+    return write(
+        tmp_path_factory.mktemp("report") / "report.html", make_rows(("vanilla", "mvb", "full"), occlusions=(0.0, 0.25))
+    )
 
 
+@pytest.mark.integration
 def test_the_page_needs_no_other_file(page):
     assert not re.findall(r"""(?:src|href)\s*=\s*['"](?!data:|#)|@import|url\((?!#)|<script""", page)
 
 
+@pytest.mark.integration
 def test_every_plot_is_well_formed(page):
     plots = re.findall(r"<svg.*?</svg>", page, re.DOTALL)
     assert len(plots) == 5 * 2 + 3 * 2 + 1
@@ -50,6 +54,7 @@ def test_every_plot_is_well_formed(page):
         ElementTree.fromstring(plot)
 
 
+@pytest.mark.integration
 def test_the_headline_has_both_readings_and_the_papers(tmp_path):
     rows = make_rows(("vanilla", "mvb", "full"))
     page = write(tmp_path / "report.html", rows)
@@ -62,6 +67,7 @@ def test_the_headline_has_both_readings_and_the_papers(tmp_path):
         assert f"<td>{paper}</td>" in line
 
 
+@pytest.mark.integration
 def test_conditions_stand_in_the_order_people_count_them(page):
     words = re.findall(r"<text[^>]*>([^<]*)</text>", page.replace("\N{MINUS SIGN}", "-"))
     assert words.index("near") < words.index("mid") < words.index("far")
@@ -69,6 +75,7 @@ def test_conditions_stand_in_the_order_people_count_them(page):
     assert words.index("-45") < words.index("0") < words.index("45")
 
 
+@pytest.mark.integration
 def test_methods_stand_in_their_order_whatever_the_rows(tmp_path):
     page = write(tmp_path / "report.html", make_rows(("full", "mvb:k=3", "mvb", "vanilla")))
     assert re.findall(r"<tr><td>([^<]*)</td><td>81</td>", page) == ["vanilla", "mvb:k=3", "mvb", "full"]
@@ -82,6 +89,7 @@ def test_a_count_that_was_never_made_is_no_count(tmp_path):
     assert line.startswith("<td>mvb</td><td>800</td><td>–</td><td>120</td>")
 
 
+@pytest.mark.integration
 def test_one_method_alone_and_names_with_markup_are_shown_too(tmp_path):
     page = write(tmp_path / "report.html", make_rows(("mvb:k=3<b>",), objects=("mug",)))
     assert "nothing to compare" in page
@@ -89,6 +97,7 @@ def test_one_method_alone_and_names_with_markup_are_shown_too(tmp_path):
     assert "mvb:k=3&lt;b&gt;" in page
 
 
+@pytest.mark.integration
 def test_pictures_are_in_the_page(tmp_path):
     page = write(
         tmp_path / "report.html",
@@ -139,6 +148,7 @@ def test_the_same_figures_give_the_same_bytes():
     assert first == second
 
 
+@pytest.mark.integration
 def test_the_papers_known_figures_are_next_to_ours(page):
     start = page.index("<h2>The paper's tables, and ours</h2>")
     tables = page[start : page.index("<h2>Methods against each other")]
@@ -162,6 +172,7 @@ def test_tables_give_the_rate_of_each_condition(tmp_path):
     assert re.findall("<td>(.*?)</td>", line)[4] == f"{np.mean(boxes):.1%}"
 
 
+@pytest.mark.integration
 def test_retries_neighbours_and_noise_are_shown_where_there_were_any(tmp_path):
     rows = make_rows(("mvb",))
     for k, row in enumerate(rows):

@@ -79,6 +79,7 @@ def test_methods_that_agree_have_the_narrower_interval():
     assert agreeing < 0.6 * at_odds
 
 
+@pytest.mark.integration
 def test_the_interval_holds_the_true_difference_about_as_often_as_it_says():
     rng = np.random.default_rng(0)
     chances = np.array([0.45, 0.20, 0.08, 0.27])

@@ -88,6 +88,7 @@ def planted() -> Samples:
     return extract_samples([episode(s, "mvb", n % 3 != 0, candidate=n) for n, s in enumerate(scenarios(1, 2))], "top1")
 
 
+@pytest.mark.integration
 def test_a_head_finds_the_informative_feature(planted):
     report = fit_head(planted)
     assert report is not None
@@ -105,6 +106,7 @@ def test_a_head_finds_the_informative_feature(planted):
     assert report.bins[-1][1] / report.bins[-1][2] > 0.9
 
 
+@pytest.mark.integration
 def test_the_head_that_is_written_is_the_regression_that_was_fitted(planted):
     from sklearn.linear_model import LogisticRegression
 
@@ -116,6 +118,7 @@ def test_the_head_that_is_written_is_the_regression_that_was_fitted(planted):
     assert min(np.abs(fit.predict_proba(z)[:, 1] - predictions).max() for fit in fits) < 1e-4
 
 
+@pytest.mark.integration
 def test_a_head_fitted_to_noise_does_not_help(planted):
     rng = np.random.default_rng(5)
     noise = Samples(
@@ -129,6 +132,7 @@ def test_a_head_fitted_to_noise_does_not_help(planted):
     assert not report.beats_base_rate
 
 
+@pytest.mark.integration
 def test_a_feature_that_never_varies_is_left_out(planted):
     features = planted.features.copy()
     features[:, list(FEATURES).index("level")] = 1.0

@@ -64,6 +64,7 @@ def test_invalid_methods_are_rejected(tmp_path):
         parse_method("vanilla:k=2")
 
 
+@pytest.mark.integration
 def test_full_uses_its_settings_and_else_the_configurations(seen, selector):
     configured, one = METHODS["full"].ranking(selector.ranking), parse_method("full:k=1").ranking(selector.ranking)
     assert configured == selector.ranking

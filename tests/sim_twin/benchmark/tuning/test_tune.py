@@ -126,6 +126,7 @@ def test_without_episodes_on_held_out_seeds_the_hand_set_values_stay(fitted):
     assert "no proposal was run" in family.why
 
 
+@pytest.mark.integration
 def test_a_head_is_proposed_as_a_file_and_taken_when_its_episodes_win(fitted, tmp_path):
     rows = [*rows_of(1, "mvb", half), *rows_of(1, "full", often)]
     runs = Runs(lambda method, n: often(n) if method.head else half(n))
@@ -151,6 +152,7 @@ def test_a_head_is_proposed_as_a_file_and_taken_when_its_episodes_win(fitted, tm
     assert FEATURES["down"] in page
 
 
+@pytest.mark.integration
 def test_the_limit_is_shared_among_the_proposals(fitted):
     runs = Runs(lambda method, n: half(n) or n in (1, 3, 5, 7, 9, 11) if method.head or method.k == 3 else half(n))
     both = fitted(TRAIN, runs=runs, head=True).families["mvb"]
