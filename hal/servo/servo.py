@@ -11,7 +11,7 @@ mailbox's immutable entries, and publishes one immutable snapshot.
 
 from __future__ import annotations
 
-from hal.base.arm import Arm
+from hal.base.arm import Arm, CommandLatency, TimedArm
 from hal.base.clock import Clock
 from hal.base.errors import CommandRejectedError, HalError, HalTimeoutError, NotConnectedError
 from hal.base.messages import ArmSetpoint, ArmState, ServoHealth, ServoMode, ServoStatus, TrajectoryChunk
@@ -220,8 +220,16 @@ class Servo:
         return make_status(snapshot, self._mailbox, self.periods, now_s)
 
     def health(self) -> ServoHealth:
-        """Return the health: timing, faults and command authority."""
-        return make_health(self._connected(), self._mailbox, self.periods, self.real_time, self.clock.now_s())
+        """Return the health: timing, latency of the commands, faults and command authority."""
+        latency = self.arm.command_latency() if isinstance(self.arm, TimedArm) else CommandLatency()
+        return make_health(
+            self._connected(),
+            self._mailbox,
+            self.periods,
+            self.clock.now_s(),
+            real_time=self.real_time,
+            latency=latency,
+        )
 
     # --- The tick -----------------------------------------------------------------------------------------------
 

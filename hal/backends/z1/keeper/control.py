@@ -94,7 +94,7 @@ def _request(local: tuple[str, int], request: str) -> dict[str, Any] | None:
             data = b""
             while not data.endswith(b"\n") and len(data) < _MAX_BYTES and (more := connection.recv(4096)):
                 data += more
-        except (FileNotFoundError, ConnectionRefusedError):  # none, or one that was killed
+        except (FileNotFoundError, ConnectionError):  # none, or one that was killed
             return None
         except OSError as error:
             raise HalTimeoutError(

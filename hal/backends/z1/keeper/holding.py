@@ -8,7 +8,7 @@ from enum import StrEnum
 import numpy as np
 
 from hal.backends.z1.keeper.page import Page
-from hal.backends.z1.posture import compute_posture
+from hal.backends.z1.keeper.posture import compute_posture
 from hal.base import z1
 from hal.z1_protocol.controller import ControllerState, decode_command, decode_state, encode_command
 from hal.z1_protocol.link import DatagramLink
