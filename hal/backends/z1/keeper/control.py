@@ -28,7 +28,7 @@ class KeeperStatus:
     phase: str
     """`hal.backends.z1.keeper.holding.Phase`."""
     q: tuple[float, ...] = ()
-    """(7,) measured joints [rad]; empty while it only stands by."""
+    """(7,) measured joints [rad]; empty in standby."""
     grip_nm: float = 0.0
     """Torque of the gripper [Nm]; the jaws hold something when it is more than friction."""
 
