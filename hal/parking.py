@@ -63,7 +63,7 @@ def park(servo: Servo, parking: Parking, abort: Event) -> bool:
             for station in (z1.Q_HOME, parking.q):
                 _move_to(servo, station, parking.speed_rad_s, abort)
     except HalError as error:
-        _LOG.warning("not parked: %s The arm holds its position: support it before you switch it off.", error)
+        _LOG.warning("not parked: %s The arm stays where it is: support it before it is switched off or let go.", error)
         return False
     _LOG.info("parked")
     return True

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, runtime_checkable
 
 from hal.base.messages import ArmSetpoint, ArmState, ServoStatus, TrajectoryChunk
 
@@ -43,6 +43,23 @@ class Arm(Protocol):
 
     def stop(self) -> None:
         """Stop at once and hold; callable at any time, from any thread."""
+        ...
+
+
+class CommandLatency(NamedTuple):
+    """Time from sending a command to the answer to it, over the last half minute [ms]; zeros while unmeasured."""
+
+    p50_ms: float = 0.0
+    p99_ms: float = 0.0
+    max_ms: float = 0.0
+
+
+@runtime_checkable
+class TimedArm(Protocol):
+    """An arm that measures the latency of its commands."""
+
+    def command_latency(self) -> CommandLatency:
+        """Return the latency; for any thread, at any time."""
         ...
 
 

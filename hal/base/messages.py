@@ -321,6 +321,12 @@ class ServoHealth:
     """Age of the owner's last command or heartbeat [s]; 0 while the lease is free."""
     real_time: tuple[str, ...]
     """Real-time resources granted to the servo's thread, such as SCHED_FIFO; empty = ordinary scheduling."""
+    command_latency_ms_p50: float = 0.0
+    """Median time from a command to the arm's answer to it [ms]; 0 where the arm does not measure it."""
+    command_latency_ms_p99: float = 0.0
+    """99th percentile of the same [ms]."""
+    command_latency_ms_max: float = 0.0
+    """Maximum of the same [ms]."""
 
     def __post_init__(self) -> None:
         _freeze(self)

@@ -48,7 +48,7 @@ DDDQ_MAX = _constant(80.0, 80.0, 80.0, 120.0, 120.0, 120.0, 120.0)
 """(7,) highest joint jerk [rad/s³]."""
 
 # --- Position servo of the vendor's controller in JOINTCTRL (wire: 25.6 · K_P and 0.0128 · K_W) -------------
-# joint4's K_P was measured as 20 and as 25, without a known rule.
+# joint4's K_P is 25 in JOINTCTRL, TEACHREPEAT and moves to poses, and 20 in the other stiff states.
 KP = 25.6 * _constant(25, 30, 20, 20, 15, 30, 5)
 """(7,) stiffness [Nm/rad]."""
 KD = 0.0128 * _constant(2000, 3000, 3000, 3000, 2000, 2000, 100)

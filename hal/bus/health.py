@@ -48,9 +48,16 @@ def describe_health(health: ServoHealth) -> str:
     command = "no command owner"
     if health.owner:
         command = f"last command of {health.owner} {1e3 * health.command_age_s:.0f} ms ago"
+    latency = ""
+    if health.command_latency_ms_max:
+        latency = (
+            f"; command latency p50 {health.command_latency_ms_p50:.1f}, p99 {health.command_latency_ms_p99:.1f}, "
+            f"max {health.command_latency_ms_max:.1f} ms"
+        )
     faults = f"; {'; '.join(health.faults)}" if health.faults else ""
     return (
         f"servo {health.mode.value} at {health.rate_hz:.1f} Hz, period p50 {health.period_ms_p50:.2f}, "
         f"p99 {health.period_ms_p99:.2f}, max {health.period_ms_max:.1f} ms, {health.overruns} overruns in "
-        f"{health.ticks} ticks; real time: {', '.join(health.real_time) or 'nothing granted'}; {command}{faults}"
+        f"{health.ticks} ticks; real time: {', '.join(health.real_time) or 'nothing granted'}; {command}"
+        f"{latency}{faults}"
     )

@@ -14,8 +14,8 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
 
+from hal.base.arm import Arm, CommandLatency, TimedArm
 from hal.base.clock import Clock
 from hal.base.errors import CommandRejectedError, HalError, HalTimeoutError, NotConnectedError
 from hal.base.messages import ArmSetpoint, ArmState, ServoHealth, ServoMode, ServoStatus, TrajectoryChunk
@@ -24,9 +24,6 @@ from hal.servo.control_loop import ControlCycle
 from hal.servo.guard import Guard
 from hal.servo.limits import ServoLimits, clip_setpoint
 from hal.servo.status import PeriodStatistics, StatusLogger, make_health, make_status
-
-if TYPE_CHECKING:
-    from hal.base.arm import Arm
 
 log = logging.getLogger(__name__)
 
@@ -242,8 +239,16 @@ class Servo:
         return make_status(snapshot, self._mailbox, self.periods, now_s)
 
     def health(self) -> ServoHealth:
-        """Return the health: timing, faults and command authority."""
-        return make_health(self._connected(), self._mailbox, self.periods, self.real_time, self.clock.now_s())
+        """Return the health: timing, latency of the commands, faults and command authority."""
+        latency = self.arm.command_latency() if isinstance(self.arm, TimedArm) else CommandLatency()
+        return make_health(
+            self._connected(),
+            self._mailbox,
+            self.periods,
+            self.clock.now_s(),
+            real_time=self.real_time,
+            latency=latency,
+        )
 
     # --- The tick -----------------------------------------------------------------------------------------------
 

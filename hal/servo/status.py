@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from hal.base.arm import CommandLatency
 from hal.base.messages import ServoHealth, ServoStatus
 from hal.base.z1 import CONTROL_PERIOD_S
 from hal.servo.command_mailbox import CommandMailbox, Snapshot
@@ -114,9 +115,15 @@ def make_status(snapshot: Snapshot, mailbox: CommandMailbox, periods: PeriodStat
 
 
 def make_health(
-    snapshot: Snapshot, mailbox: CommandMailbox, periods: PeriodStatistics, real_time: tuple[str, ...], now_s: float
+    snapshot: Snapshot,
+    mailbox: CommandMailbox,
+    periods: PeriodStatistics,
+    now_s: float,
+    *,
+    real_time: tuple[str, ...],
+    latency: CommandLatency,
 ) -> ServoHealth:
-    """Return the health from the same inputs, for a thread that was granted `real_time`."""
+    """Return the health from the same inputs, for a thread that was granted `real_time` and an arm with `latency`."""
     summary = periods.summary()
     owner = mailbox.lease.current_owner(now_s, at_rest=snapshot.at_rest)
     return ServoHealth(
@@ -134,6 +141,9 @@ def make_health(
         # Another thread may record a heartbeat after `now_s` was read.
         command_age_s=max(now_s - mailbox.lease.last_heartbeat_s, 0.0) if owner else 0.0,
         real_time=real_time,
+        command_latency_ms_p50=latency.p50_ms,
+        command_latency_ms_p99=latency.p99_ms,
+        command_latency_ms_max=latency.max_ms,
     )
 
 

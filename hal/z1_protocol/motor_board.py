@@ -33,6 +33,10 @@ PERIOD_S = 0.004
 """Period of the controller's commands [s]; the mean measured on the vendor's controller is 4.04 ms."""
 SELF_CHECK = b"\x02"
 """Request that the controller sends every 0.2 s until the board answers with `encode_self_check`."""
+CALIBRATION = b"\x01"
+"""Request that makes the present pose the zero; the controller waits two seconds for the answer."""
+CALIBRATION_DONE = b"\x10"
+"""Answer to `CALIBRATION` that the vendor's controller takes for success; it takes others, or none, for a failure."""
 COMMAND_SIZES = tuple(n * JOINT_CMD.itemsize for n in (z1.N_JOINTS, z1.N_ARM))
 """140 B, and 120 B without gripper."""
 STATE_SIZES = tuple(n * JOINT_STATE.itemsize for n in (z1.N_JOINTS, z1.N_ARM))

@@ -12,19 +12,37 @@ from dataclasses import replace
 import numpy as np
 
 from hal.base import z1
-from hal.z1_protocol.controller import Command, ControllerState
-from hal.z1_protocol.records import JointCommands, JointStates, ProtocolError
+from hal.z1_protocol.controller import KP_JOINTCTRL, Command, ControllerState
+from hal.z1_protocol.records import JointCommands, JointStates, MotorError, ProtocolError
 from hal.z1_protocol.states import MOVES, Fsm, is_granted
-from sim_twin.controller.behaviours import Behaviour, Damping, Following, Forwarding, Servos, Teaching, Tracking
-from sim_twin.controller.motion_planner import MotionPlanner
-from sim_twin.controller.paths import JointPath
+from sim_twin.controller.behaviours import (
+    KP_HOLDING,
+    Behaviour,
+    Damping,
+    Following,
+    Forwarding,
+    Servos,
+    Teaching,
+    Tracking,
+    TwistTracking,
+)
+from sim_twin.controller.motion_planner import Motion, MotionPlanner
+
+CALIBRATION_S = 2.0
+"""Time for which the state machine waits for the motor board's calibration, before CALIBRATION is shown [s]."""
+BOARD_TIMEOUT_S = 2.2
+"""Silence of the motor board after which the controller falls to PASSIVE [s]."""
+
+_RELEASING = np.uint8(MotorError.OVER_CURRENT | MotorError.LEAKAGE | MotorError.OVERHEAT)
+_KP: dict[Fsm, np.ndarray] = dict.fromkeys((Fsm.MOVEJ, Fsm.MOVEL, Fsm.MOVEC, Fsm.TEACHREPEAT), KP_HOLDING)
 
 
 class Controller:
     """Controller of one arm; it starts in PASSIVE.
 
     A request takes effect in two steps, as in the vendor's: in the first the present state runs once more, with the
-    request's body as its command; in the second the new state begins, with the body that is the newest by then.
+    request's body as its command; in the second the new state begins, with the body that is the newest by then. A
+    motor's over-current, leakage or overheat and a silent motor board request PASSIVE; a lost motor does not.
 
     Args:
         measured: the first measurement.
@@ -49,15 +67,23 @@ class Controller:
         self._granted: Fsm | None = None
         self._commands = JointCommands(q=measured.q)
         self._rejected: Command | None = None
+        self._board_silent_s = self._calibrating_s = 0.0
+        self._newest = measured
 
     def step(self, command: Command, measured: JointStates, dt_s: float) -> JointCommands:
         """Advance by `dt_s` [s]; return the commands for the motors, (7,) each, in the motors' own zero.
 
         Args:
             command: the client's newest command.
-            measured: the newest measurement of the motors.
+            measured: the newest measurement of the motors; the same object while their board is silent.
             dt_s: time since the last step [s].
         """
+        if self._granted is Fsm.CALIBRATION and self._calibrating_s < CALIBRATION_S:
+            self._calibrating_s += dt_s
+            return replace(self._commands, q=self._commands.q + self.zero)
+        self._calibrating_s = 0.0
+        self._board_silent_s = self._board_silent_s + dt_s if measured is self._newest else 0.0
+        self._newest = measured
         self.measured = replace(measured, q=measured.q - self.zero)
         if self._granted is not None:
             self._enter(self._granted, command, measured)
@@ -86,6 +112,8 @@ class Controller:
             self.invalid_reason = str(error)
 
     def _find_next(self, requested: Fsm) -> Fsm | None:
+        if self._board_silent_s >= BOARD_TIMEOUT_S or (self.measured.error & _RELEASING).any():
+            return None if self.fsm is Fsm.PASSIVE else Fsm.PASSIVE
         if self._behaviour.done:
             return Fsm.PASSIVE if self.fsm is Fsm.CALIBRATION else Fsm.JOINTCTRL
         if requested in (Fsm.INVALID, self.fsm) or not is_granted(self.fsm, requested):
@@ -105,15 +133,18 @@ class Controller:
                 self._behaviour = Damping(done=True)
             case Fsm.LOWCMD:
                 self._behaviour = Forwarding()
-            case Fsm.JOINTCTRL | Fsm.CARTESIAN:
+            case Fsm.JOINTCTRL:
                 self._behaviour = Tracking(start, self._servos)
+            case Fsm.CARTESIAN:
+                self._behaviour = TwistTracking(start, self._servos, self.planner.kinematics)
             case Fsm.TEACH:
                 self._behaviour, self._lesson = Teaching(self._servos), self._read_label(command)
             case _:
-                self._behaviour = Following(self._plan(state, command, start), start, self._servos)
+                motion = self._plan(state, command, start)
+                self._behaviour = Following(motion, start, self._servos, _KP.get(state, KP_JOINTCTRL))
         self.fsm = state
 
-    def _plan(self, state: Fsm, command: Command, start: np.ndarray) -> list[JointPath]:
+    def _plan(self, state: Fsm, command: Command, start: np.ndarray) -> Motion:
         if state is Fsm.SAVESTATE:
             if label := self._read_label(command):
                 self.planner.labels[label] = self.measured.q[: z1.N_ARM].copy()
@@ -122,7 +153,7 @@ class Controller:
                 return self.planner.plan(command, state, start)
             except ProtocolError as error:
                 self._reject(command, error)
-        return []
+        return Motion()
 
     def _read_label(self, command: Command) -> str:
         try:

@@ -2,21 +2,35 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from hal.base import z1
 from hal.base.z1_kinematics import PivotKinematics, pose_from_posture, posture_from_pose
 from hal.z1_protocol.controller import LABELS, Command, TrajectoryCommand
 from hal.z1_protocol.states import Fsm
-from sim_twin.controller.behaviours import TEACH_PERIOD_S
-from sim_twin.controller.paths import JointPath, plan_arc_path, plan_joint_path, plan_line_path
+from sim_twin.controller.paths import JointPath, Path, Recording
+from sim_twin.controller.pivot_paths import ArcPath, LinePath
 
 LABEL_SPEED = 1.0
 """Speed of the fastest joint towards a label [rad/s] (measured on the vendor's controller)."""
+TEACH_PERIOD_S = 0.02
+"""Period of the points of a recording [s]; the vendor's was not measured."""
 
-# Speeds of a move that requests none or a negative one: [rad/s] for MOVEJ, [m/s] for the others (measured).
+# Speed of a move that requests none [rad/s for MOVEJ, m/s for the others], and of the demonstration [rad/s] (measured).
 _DEFAULT_SPEED = {Fsm.MOVEJ: 1.0, Fsm.MOVEL: 0.3, Fsm.MOVEC: 0.3}
+_SHOW_SPEED = 2.0
+_SHOW_GRIPPER_RAD = -np.pi / 3.0
 _MAX_POSE = 100.0  # [rad, m]; poses beyond are garbage, and would overflow the inverse kinematics
+
+
+class Motion(NamedTuple):
+    """Paths, one after the other; none when the motion is impossible."""
+
+    paths: tuple[Path, ...] = ()
+    repeat_from: int | None = None
+    """First of the paths that are repeated for ever."""
 
 
 class MotionPlanner:
@@ -27,57 +41,61 @@ class MotionPlanner:
         """Saved poses (6,) [rad]."""
         self.recordings: dict[str, np.ndarray] = {}
         """Taught motions (N, 7) [rad], one row every `TEACH_PERIOD_S`."""
-        self._kinematics = PivotKinematics()
-        self._kinematics.inverse(np.eye(4), np.zeros(z1.N_ARM))  # the solver compiles itself at its first use
+        self.kinematics = PivotKinematics()
+        """Kinematics of the pivot, for this thread."""
+        self.kinematics.inverse(np.eye(4), np.zeros(z1.N_ARM))  # the solver compiles itself at its first use
 
     def posture(self, q: np.ndarray) -> np.ndarray:
         """Return the posture (6,) [rad, m] of the pivot at arm joints `q` (6,) [rad]."""
-        return posture_from_pose(self._kinematics.forward(q))
+        return posture_from_pose(self.kinematics.forward(q))
 
-    def plan(self, command: Command, state: Fsm, start: np.ndarray) -> list[JointPath]:
-        """Return the paths of a motion from `start` (7,) [rad], one after the other; none when it is impossible.
+    def plan(self, command: Command, state: Fsm, start: np.ndarray) -> Motion:
+        """Return the motion of a state from `start` (7,) [rad].
 
         Raises:
             ProtocolError: the body does not fit the state.
         """
         match state:
             case Fsm.BACKTOSTART:
-                return [plan_joint_path(start, np.append(self.labels["startFlat"], z1.GRIPPER_CLOSED), LABEL_SPEED)]
+                goal = np.append(self.labels["startFlat"], z1.GRIPPER_CLOSED)
+                return Motion((JointPath(start, goal, LABEL_SPEED),))
             case Fsm.MOVEJ | Fsm.MOVEL | Fsm.MOVEC:
                 return self._plan_move(command.trajectory(), state, start)
             case Fsm.TRAJECTORY:
                 return self._plan_show(start)
-        label = command.label()
+            case _:
+                return self._plan_label(command.label(), state, start)
+
+    def _plan_label(self, label: str, state: Fsm, start: np.ndarray) -> Motion:
         if state is Fsm.TOSTATE:
-            return [self._to_label(label, start)] if label in self.labels else []
+            if label not in self.labels:
+                return Motion()
+            return Motion((JointPath(start, np.append(self.labels[label], start[z1.N_ARM]), LABEL_SPEED),))
         if label not in self.recordings:
-            return []
+            return Motion()
         taught = self.recordings[label]
-        replay = JointPath(taught, (len(taught) - 1) * TEACH_PERIOD_S, recorded=True)
-        return [plan_joint_path(start, taught[0], LABEL_SPEED), replay]
+        return Motion((JointPath(start, taught[0], LABEL_SPEED), Recording(taught, TEACH_PERIOD_S)))
 
-    def _to_label(self, label: str, start: np.ndarray) -> JointPath:
-        return plan_joint_path(start, np.append(self.labels[label], start[z1.N_ARM]), LABEL_SPEED)
+    def _plan_show(self, start: np.ndarray) -> Motion:
+        """Return the demonstration: to both sides, with the jaws opening and closing."""
+        middle = np.append(self.labels["show_mid"], z1.GRIPPER_CLOSED)
+        paths: list[Path] = [JointPath(start, middle, LABEL_SPEED)]
+        for label in ("show_left", "show_right"):
+            side = np.append(self.labels[label], _SHOW_GRIPPER_RAD)
+            paths += [JointPath(middle, side, _SHOW_SPEED), JointPath(side, middle, _SHOW_SPEED)]
+        return Motion(tuple(paths), repeat_from=1)
 
-    def _plan_show(self, start: np.ndarray) -> list[JointPath]:
-        """Return one round of the demonstration, to both sides with the jaws opening and closing."""
-        paths = []
-        for label, gripper in (("show_mid", 0.0), ("show_right", -1.0), ("show_mid", 0.0), ("show_left", -1.0)):
-            goal = np.append(self.labels[label], gripper)
-            paths.append(plan_joint_path(start, goal, LABEL_SPEED))
-            start = goal
-        return paths
-
-    def _plan_move(self, move: TrajectoryCommand, state: Fsm, start: np.ndarray) -> list[JointPath]:
+    def _plan_move(self, move: TrajectoryCommand, state: Fsm, start: np.ndarray) -> Motion:
         gripper = float(np.clip(move.gripper_rad, z1.GRIPPER_OPEN, z1.GRIPPER_CLOSED))
         if not (np.abs(move.poses) <= _MAX_POSE).all():
-            return []
+            return Motion()
         speed = move.max_speed if move.max_speed > 0.0 else _DEFAULT_SPEED[state]
+        goals = [pose_from_posture(posture) for posture in move.poses[: 2 if state is Fsm.MOVEC else 1]]
+        found = [q for goal in goals if (q := self.kinematics.inverse(goal, start[: z1.N_ARM])) is not None]
+        if len(found) < len(goals):
+            return Motion()
         if state is Fsm.MOVEL:
-            path = plan_line_path(self._kinematics, start, move.poses[0], gripper, speed)
-        elif state is Fsm.MOVEC:
-            path = plan_arc_path(self._kinematics, start, move.poses, gripper, speed)
-        else:
-            q = self._kinematics.inverse(pose_from_posture(move.poses[0]), start[: z1.N_ARM])
-            path = None if q is None else plan_joint_path(start, np.append(q, gripper), speed)
-        return [path] if path is not None else []
+            return Motion((LinePath(self.kinematics, start, goals[0], gripper, speed),))
+        if state is Fsm.MOVEC:
+            return Motion((ArcPath(self.kinematics, start, np.array(goals)[:, :3, 3], gripper, speed),))
+        return Motion((JointPath(start, np.append(found[0], gripper), speed),))

@@ -1,12 +1,16 @@
-"""A simulated arm behind its motor board: the self-check, and a measurement as the answer to every command."""
+"""A simulated arm behind its motor board: self-check, calibration, and a measurement as the answer to a command."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 
 from hal.backends.z1.faults import motor_values
 from hal.base import z1
 from hal.z1_protocol.motor_board import (
+    CALIBRATION,
+    CALIBRATION_DONE,
     COMMAND_SIZES,
     MOTOR_HEALTHY,
     SELF_CHECK,
@@ -38,11 +42,12 @@ class MotorBoard:
         self.world = world
         self.motors = Motors(world, injected_faults)
         self.invalid_datagrams = 0
-        """Datagrams that were neither self-check nor command."""
+        """Datagrams that were neither self-check nor calibration nor command."""
         self.invalid_reason = ""
         """Reason for the last one."""
         self._gripper = gripper
         self._n = z1.N_JOINTS if gripper else z1.N_ARM
+        self._zero = np.zeros(z1.N_JOINTS)  # set by a calibration, of the arm alone
 
     def receive(self, data: bytes | memoryview) -> bytes | None:
         """Process a datagram; return the answer, None when it was invalid or the board is silent. Never raises."""
@@ -50,6 +55,9 @@ class MotorBoard:
             return None
         if data == SELF_CHECK:
             return encode_self_check(self._self_check())
+        if data == CALIBRATION:
+            self._zero[: z1.N_ARM] = self.motors.measure().q[: z1.N_ARM]
+            return CALIBRATION_DONE
         try:
             if len(data) in COMMAND_SIZES and len(data) != COMMAND_SIZES[not self._gripper]:
                 raise ProtocolError(
@@ -57,7 +65,8 @@ class MotorBoard:
                     f"{COMMAND_SIZES[not self._gripper]}.",
                     code="wrong_size",
                 )
-            self.motors.handle_command(decode_command(data))
+            commands = decode_command(data)
+            self.motors.handle_command(replace(commands, q=commands.q + self._zero[: self._n]))
         except ProtocolError as error:
             self.invalid_datagrams += 1
             self.invalid_reason = str(error)
@@ -77,6 +86,7 @@ class MotorBoard:
 
     def _measure(self) -> JointStates:
         states = self.motors.measure()
+        states = replace(states, q=states.q - self._zero)
         if self._gripper:
             return states
         fields = ("q", "dq", "ddq", "tau", "temperature_c", "error", "link")

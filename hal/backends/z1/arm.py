@@ -17,8 +17,8 @@ from hal.backends.z1.faults import motor_values
 from hal.backends.z1.keeper.owner import KeeperOwner, take_over
 from hal.backends.z1.mode_machine import ModeMachine
 from hal.backends.z1.motions import MOVE_TIMEOUT_S, ControllerMotions
-from hal.backends.z1.pacing import LatencySummary
 from hal.backends.z1.requests import StateRequester
+from hal.base.arm import CommandLatency
 from hal.base.clock import Clock, WallClock
 from hal.base.errors import CommandRejectedError, HalError, HalTimeoutError
 from hal.base.messages import ArmSetpoint, ArmState
@@ -334,7 +334,7 @@ class Z1Arm:
                 invalid_reason=client.invalid_reason,
             )
 
-    def command_latency(self) -> LatencySummary:
+    def command_latency(self) -> CommandLatency:
         """Return the time from a command to the controller's answer to it; without the lock, for any thread."""
         return self._client.pacer.summary()
 

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from hal.backends.z1.faults import FaultLatch
+from hal.backends.z1.keeper.posture import compute_posture
 from hal.backends.z1.pacing import MAX_LATENCY_S, CommandPacer
-from hal.backends.z1.posture import compute_posture
 from hal.base.clock import Clock
 from hal.base.errors import CommandRejectedError, HalTimeoutError
 from hal.base.z1 import CONTROL_PERIOD_S, DQ_MAX
@@ -269,7 +269,7 @@ class Z1Client:
     # --- Posture ----------------------------------------------------------------------------------------------------
 
     def posture(self) -> JointCommands:
-        """Return the present posture as motor commands; see `hal.backends.z1.posture`."""
+        """Return the present posture as motor commands; see `hal.backends.z1.keeper.posture`."""
         joints = self.command.joints
         known = self.carries_joints
         return compute_posture(self.newest.joints, joints["q"] if known else None, joints["kp"] if known else None)

@@ -27,6 +27,7 @@ _STALE_S = 0.1
 _STALE_RAD = 0.05
 _STILL_RAD = 0.001  # a command that moved less is at rest, where measurements may repeat
 _GRIPPER = z1.N_ARM
+_SAME_JAW_RAD = 0.01
 _REST = np.zeros(z1.N_JOINTS)
 _REST.setflags(write=False)
 
@@ -50,6 +51,7 @@ class CommandWriter:
         self.q_sent = self._still_q = self._q_wire = _REST
         """(7,) last position commanded [rad]."""
         self._still_s = 0.0
+        self._held_jaw: tuple[float, float] | None = None
 
     def prepare(self, mode: Z1Mode) -> None:
         """Load what a mode needs, which takes a second: never while the arm sinks in PASSIVE."""
@@ -66,6 +68,8 @@ class CommandWriter:
         # While tracking, the jaw's torque is that of a target ahead of it; LOWCMD keeps it by `grip_nm`.
         q = np.append(measured[:_GRIPPER], self._client.posture().q[_GRIPPER])
         self.q_sent = self._still_q = self._q_wire = q if mode is Z1Mode.TRACKING else measured
+        # A client that starts from the measurement, as after a change of drivers, must not let go of an object.
+        self._held_jaw = (measured[_GRIPPER], q[_GRIPPER]) if mode is Z1Mode.TRACKING else None
         self._still_s = self._client.newest_s
 
     def write_hold(self) -> None:
@@ -84,6 +88,12 @@ class CommandWriter:
         if self.grip_nm is not None:
             q, dq = q.copy(), dq.copy()
             q[_GRIPPER], dq[_GRIPPER] = measured[_GRIPPER] + self.grip_nm / z1.KP[_GRIPPER], 0.0
+        elif self._held_jaw is not None:
+            found, held = self._held_jaw
+            if abs(q[_GRIPPER] - found) < _SAME_JAW_RAD:
+                q = np.append(q[:_GRIPPER], held)
+            else:
+                self._held_jaw = None
         allowed = clip_setpoint(self._limits, q, dq, q_last=self.q_sent, q_measured=measured, dq_measured=joints.dq)
         q = np.minimum(np.maximum(allowed.q, measured - _MAX_LEAD_RAD), measured + _MAX_LEAD_RAD)
         # A controller that has no room for commands must not find a leap when it has again.

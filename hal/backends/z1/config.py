@@ -9,8 +9,8 @@ import numpy as np
 
 from hal.backends.z1.client import DatagramCounts
 from hal.backends.z1.faults import Fault
-from hal.backends.z1.pacing import LatencySummary
 from hal.backends.z1.requests import StateRequest
+from hal.base.arm import CommandLatency
 from hal.base.errors import InvalidValueError
 from hal.z1_protocol.controller import COMMAND_PORT, STATE_PORT
 from hal.z1_protocol.states import Fsm
@@ -69,7 +69,7 @@ class Z1Diagnostics:
     """Age of the newest answer [s]."""
     unchanged_s: float
     """Duration for which the controller has repeated one measurement [s]; long while moving = its board is silent."""
-    latency: LatencySummary
+    latency: CommandLatency
     """Time from a command to the answer to it, over the last half minute."""
     request: StateRequest | None
     """The last request for a state; None before the first."""

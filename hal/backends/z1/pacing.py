@@ -8,9 +8,10 @@ order of the commands, which identifies them although no answer has a number.
 from __future__ import annotations
 
 from collections import deque
-from typing import NamedTuple
 
 import numpy as np
+
+from hal.base.arm import CommandLatency
 
 MAX_UNANSWERED = 2
 """Commands on their way, unread or unanswered."""
@@ -24,14 +25,6 @@ _MAX_TRACKED = 64
 _RECENT = 16
 _LATE_COUNT = 3  # one late answer may be a hiccup of this machine or of the controller's
 _CAPACITY = 15_000  # half a minute of answers
-
-
-class LatencySummary(NamedTuple):
-    """Time from sending a command to the answer to it [ms]; zeros while unmeasured."""
-
-    p50_ms: float = 0.0
-    p99_ms: float = 0.0
-    max_ms: float = 0.0
 
 
 class CommandPacer:
@@ -114,10 +107,10 @@ class CommandPacer:
         self._late_count = self._late_count + 1 if certain_s > MAX_LATENCY_S else 0
         self.late_s = certain_s if self._late_count >= _LATE_COUNT else 0.0
 
-    def summary(self) -> LatencySummary:
+    def summary(self) -> CommandLatency:
         """Return percentiles of the latency over the last half minute."""
         measured_ms = self._ring_ms[: min(self._measured, _CAPACITY)].copy()
         if not len(measured_ms):
-            return LatencySummary()
+            return CommandLatency()
         ranks = [round(quantile * (len(measured_ms) - 1)) for quantile in (0.5, 0.99, 1.0)]
-        return LatencySummary(*np.partition(measured_ms, ranks)[ranks].tolist())
+        return CommandLatency(*np.partition(measured_ms, ranks)[ranks].tolist())

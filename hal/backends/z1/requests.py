@@ -26,7 +26,7 @@ _REMEDIES = {
 _DEFAULT_REMEDY = "Bring it to JOINTCTRL first."
 _TRIES = 3  # in case a request or its answer is lost
 # The controller may be busy, as while it plans a path (0.3 s): a request in its socket is late, not refused.
-_UNSEEN_S = 2.0
+_UNREAD_S = 2.0
 _MIN_ANSWERS = 10  # after the request's own, before it counts as refused
 # The controller's states change every 4 ms, by the newest command at that time: three, 2 ms apart, cannot be missed.
 _REPEATS = 3
@@ -90,7 +90,7 @@ class StateRequester:
         Raises:
             CommandRejectedError: the transition is not allowed (`transition_not_allowed`), the controller has seen the
                 request and does not follow (`request_refused`), or a stop interrupted it (`cancelled`).
-            HalTimeoutError: it has not seen the request (`request_unseen`), or moves otherwise than requested
+            HalTimeoutError: it has not seen the request (`request_unread`), or moves otherwise than requested
                 (`request_unconfirmed`).
         """
         client = self._client
@@ -194,16 +194,16 @@ class StateRequester:
                 request.phase = RequestPhase.SEEN
             return request.state in client.visited
 
-        if not exchange_until(lambda: has_effect() or request.phase is RequestPhase.SEEN, _UNSEEN_S):
+        if not exchange_until(lambda: has_effect() or request.phase is RequestPhase.SEEN, _UNREAD_S):
             raise HalTimeoutError(
                 f"Z1: the controller at {client.link.describe()} has not read a request for {request.state.name} for "
                 f"{clock.now_s() - asked_s:.1f} s. It was taken back; a controller that is only busy may still begin "
                 f"it. Keep away from the arm, and restart `z1_ctrl` if it stays silent.",
-                code="request_unseen",
+                code="request_unread",
             )
         if has_effect() or exchange_until(has_effect, timeout_s):
             return True
-        while len(client.visited) < _MIN_ANSWERS and clock.now_s() - client.newest_s < _UNSEEN_S:
+        while len(client.visited) < _MIN_ANSWERS and clock.now_s() - client.newest_s < _UNREAD_S:
             if exchange_until(has_effect, timeout_s):
                 return True
         return False
@@ -222,7 +222,7 @@ class StateRequester:
             ended = next((i for i, state in enumerate(reversed(newest)) if state is request.state), len(newest))
             return ended >= _ENDED or newest[-_STARTED:].count(request.state) == _STARTED
 
-        client.exchange_until(is_decided, _UNSEEN_S)
+        client.exchange_until(is_decided, _UNREAD_S)
         if ended >= _ENDED and self._speed() < _MOVING_RAD_S:
             raise self._refuse(request)
 

@@ -206,3 +206,17 @@ def test_a_controller_starts_two_arms_and_moves_one(ports: list[int]) -> None:
         assert len(exchange(one, bytes(140))) == 154
     assert positions(states[0])[0] == pytest.approx(goals[0][0], abs=0.05)
     assert positions(states[1])[0] == pytest.approx(START[0], abs=0.05)
+
+
+def test_a_calibration_makes_the_present_pose_the_zero_of_measurements_and_commands(board: MotorBoard) -> None:
+    Controller().drive(board, [START] * 50)
+    assert board.receive(b"\x01") == b"\x10"
+    state = board.receive(bytes(140))
+    assert state is not None
+    assert positions(state) == pytest.approx(np.append(np.zeros(6), START[6]), abs=0.01)
+    hold = command(np.append(np.zeros(6), START[6]), FeedForward().torque(START, np.zeros(7)))
+    for _ in range(200):
+        board.receive(hold)
+        board.tick()
+        board.world.step()
+    assert board.world.read_arm()[0] == pytest.approx(START, abs=0.05)

@@ -46,7 +46,10 @@ class IdealArm:
             if self.commands.kp.any() and self.controller.fsm is not Fsm.LOWCMD:
                 step = np.abs(self.commands.q - self.states.q).max() / PERIOD_S
                 self.max_speed = max(self.max_speed, float(step))
-                self.states = replace(self.states, q=self.commands.q)
+                q = self.commands.q
+            else:
+                q = self.states.q
+            self.states = replace(self.states, q=q)  # a new measurement, as the board is not silent
 
     def finish(self, timeout_s: float = 20.0) -> None:
         for _ in range(round(timeout_s / 0.1)):

@@ -84,6 +84,11 @@ class VendorController(FakeController):
         if not (self.mute or elsewhere):
             self.outbox.append((now_s, self.answer()))
 
+    def _step(self, dt_s: float) -> None:
+        super()._step(dt_s)
+        if self.fsm not in (Fsm.PASSIVE, Fsm.LOWCMD):  # the torque with which the jaw is pressed on an object
+            self.tau = np.append(self.tau[: z1.N_ARM], z1.KP[z1.N_ARM] * (self.target - self.q)[z1.N_ARM])
+
     def _execute(self, command: Command) -> None:
         state = command.state
         if state in self.ignored_requests or (state is not Fsm.INVALID and not is_granted(self.fsm, state)):

@@ -28,7 +28,7 @@ class KeeperStatus:
     phase: str
     """`hal.backends.z1.keeper.holding.Phase`."""
     q: tuple[float, ...] = ()
-    """(7,) measured joints [rad]; empty while it only stands by."""
+    """(7,) measured joints [rad]; empty in standby."""
     grip_nm: float = 0.0
     """Torque of the gripper [Nm]; the jaws hold something when it is more than friction."""
 
@@ -94,7 +94,7 @@ def _request(local: tuple[str, int], request: str) -> dict[str, Any] | None:
             data = b""
             while not data.endswith(b"\n") and len(data) < _MAX_BYTES and (more := connection.recv(4096)):
                 data += more
-        except (FileNotFoundError, ConnectionRefusedError):  # none, or one that was killed
+        except (FileNotFoundError, ConnectionError):  # none, or one that was killed
             return None
         except OSError as error:
             raise HalTimeoutError(

@@ -8,7 +8,7 @@ from enum import StrEnum
 import numpy as np
 
 from hal.backends.z1.keeper.page import Page
-from hal.backends.z1.posture import compute_posture
+from hal.backends.z1.keeper.posture import compute_posture
 from hal.base import z1
 from hal.z1_protocol.controller import ControllerState, decode_command, decode_state, encode_command
 from hal.z1_protocol.link import DatagramLink
@@ -117,7 +117,7 @@ class Keeper:
         if self.phase is Phase.RELEASING:
             requested = Fsm.PASSIVE
         elif self.phase is Phase.HOLDING and state is not None and state.state not in _STAYS:
-            requested = Fsm.JOINTCTRL  # out of a motion, a teaching, or motor commands that nobody renews
+            requested = Fsm.JOINTCTRL  # out of a motion, a teaching, or motor commands that are not renewed
         if state is not None and (requested is not Fsm.INVALID or command is None):
             known = command is not None
             posture = compute_posture(state.joints, command.q if known else None, command.kp if known else None)

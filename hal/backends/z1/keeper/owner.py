@@ -61,13 +61,13 @@ class KeeperOwner:
         self._ready = False
 
     def start(self, link: int) -> None:
-        """Start the process, which shares the socket `link`; it stands by once `is_ready`."""
+        """Start the process, which shares the socket `link`; it is in standby once `is_ready`."""
         self._page_file, self._link = make_page_file(), link
         self._page, self._ready = Page(self._page_file), False
         self._spawn()
 
     def is_ready(self) -> bool:
-        """Return whether the process stands by.
+        """Return whether the process is in standby.
 
         Raises:
             HalError: it has ended instead (`keeper_failed`).

@@ -14,6 +14,7 @@ from hal.base import z1
 from hal.base.clock import ManualClock
 from hal.base.errors import CommandRejectedError, HalTimeoutError
 from hal.base.messages import ArmSetpoint, ServoMode
+from hal.bus.health import describe_health
 from hal.servo.servo import Servo
 from hal.z1_protocol.controller import LABELS, TrajectoryCommand, encode_command
 from hal.z1_protocol.states import Fsm
@@ -157,7 +158,7 @@ def test_a_request_that_is_never_read_is_retracted_and_not_called_refused() -> N
     bench = make_bench()
     bench.arm.connect()
     bench.peer.blocked_until_s = bench.clock.now_s() + 3.0
-    with raises(HalTimeoutError, "request_unseen"):
+    with raises(HalTimeoutError, "request_unread"):
         bench.arm.begin_move(Fsm.TOSTATE, "forward")
     assert bench.arm.diagnostics().request.phase is RequestPhase.RETRACTED
     before = bench.peer.q.copy()
@@ -262,3 +263,28 @@ def test_a_grip_survives_every_change_of_mode() -> None:
     bench.arm.enter(Z1Mode.TRACKING)
     lead = bench.peer.received[-1].joints().q[6] - bench.peer.q[6]
     assert lead * z1.KP[6] == pytest.approx(2.0, abs=0.2)
+
+
+def test_an_object_in_the_jaws_stays_there_when_a_new_driver_and_servo_take_the_arm_over() -> None:
+    bench = make_bench()
+    bench.peer.stuck, bench.peer.fsm = 6, Fsm.JOINTCTRL
+    bench.peer.target[6] += 2.0 / z1.KP[6]  # as the driver before commanded it
+    servo = Servo(bench.arm, bench.clock)
+    servo.connect()
+    for _ in range(200):
+        servo.tick()
+        bench.clock.advance(PERIOD_S)
+        lead = bench.peer.target[6] - bench.peer.q[6]
+        assert lead * z1.KP[6] == pytest.approx(2.0, abs=0.2)
+
+
+def test_the_latency_is_part_of_the_servos_health() -> None:
+    bench = make_bench()
+    servo = Servo(bench.arm, bench.clock)
+    servo.connect()
+    for _ in range(100):
+        servo.tick()
+        bench.clock.advance(PERIOD_S)
+    health = servo.health()
+    assert 0.0 < health.command_latency_ms_p50 <= health.command_latency_ms_p99 <= health.command_latency_ms_max
+    assert "command latency p50" in describe_health(health)

