@@ -57,7 +57,7 @@ def run_supervised(
     work: Callable[[], None],
     on_failure: Callable[[str], None],
     *,
-    policy: RestartPolicy = RestartPolicy(),  # noqa: B008 - frozen
+    policy: RestartPolicy = RestartPolicy(),
     clock: Clock | None = None,
     stop_requested: threading.Event | None = None,
 ) -> Exception | None:

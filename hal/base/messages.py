@@ -16,7 +16,6 @@ import numpy as np
 from hal.base.errors import InvalidMessageError
 from hal.base.z1 import N_JOINTS
 
-
 MAX_MAGNITUDE = 1e6
 """Maximum magnitude of every number of an array; joint speeds, torques and distances are below 1e3 in SI units."""
 MAX_STAMP_S = 1e11
@@ -72,9 +71,7 @@ def _freeze(message: Any, **arrays: tuple[Any, tuple[int | None, ...]]) -> None:
     """Replace the message's `arrays` by read-only copies of the dtype and shape, and check all its other fields."""
     kind = type(message)
     for name, (dtype, shape) in arrays.items():
-        object.__setattr__(
-            message, name, frozen_array(getattr(message, name), dtype, shape, f"{kind.__name__}.{name}")
-        )
+        object.__setattr__(message, name, frozen_array(getattr(message, name), dtype, shape, f"{kind.__name__}.{name}"))
     for name in _plain_fields(kind):
         _check_plain(getattr(message, name), f"{kind.__name__}.{name}")
 

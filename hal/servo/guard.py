@@ -129,14 +129,16 @@ def measure_margins(q, joints, lower, upper, T_flange_pivot):
 
 
 @njit(cache=True, nogil=True)
-def find_first_outside(q, q_now, joints, lower, upper, T_flange_pivot, allowed):
+def find_first_outside(q, q_now, joints, lower, upper, T_flange_pivot, allowed):  # noqa: PLR0917 - as `measure_margins`
     """Return index, boundary and margin [m] of the first of the postures `q` (N, 7) that is outside; index −1 if none.
 
     `allowed` (3,) are the margins that each boundary needs [m]; less is allowed where `q_now` (7,) has less already.
     """
     lowest = np.empty(3)
     for k in range(-1, len(q)):
-        box, table, own = measure_margins(q_now.reshape(1, 7) if k < 0 else q[k : k + 1], joints, lower, upper, T_flange_pivot)
+        box, table, own = measure_margins(
+            q_now.reshape(1, 7) if k < 0 else q[k : k + 1], joints, lower, upper, T_flange_pivot
+        )
         margins = (box[0], table[0], own[0])
         for i in range(3):
             if k < 0:

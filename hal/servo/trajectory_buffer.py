@@ -241,9 +241,7 @@ def _check_points(
             )
 
 
-def _rates(
-    q: np.ndarray, dq: np.ndarray, limits: ServoLimits
-) -> list[tuple[str, np.ndarray, np.ndarray, str]]:
+def _rates(q: np.ndarray, dq: np.ndarray, limits: ServoLimits) -> list[tuple[str, np.ndarray, np.ndarray, str]]:
     """Return name, values (N, 7), limits (7,) and unit of the rates of the points and of the cubics between them."""
     h = CONTROL_PERIOD_S
     slope = np.diff(q, axis=0) / h

@@ -26,9 +26,7 @@ ZERO = np.zeros(N_JOINTS)
 def clip(
     q: np.ndarray, dq: np.ndarray, q_last: np.ndarray, q_measured: np.ndarray, dq_measured: np.ndarray = ZERO
 ) -> ClippedSetpoint:
-    return clip_setpoint(
-        LIMITS, q, dq, q_command=MIDDLE, q_last=q_last, q_measured=q_measured, dq_measured=dq_measured
-    )
+    return clip_setpoint(LIMITS, q, dq, q_command=MIDDLE, q_last=q_last, q_measured=q_measured, dq_measured=dq_measured)
 
 
 def test_a_setpoint_within_the_limits_is_unchanged() -> None:

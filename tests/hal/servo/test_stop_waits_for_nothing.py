@@ -105,9 +105,7 @@ def test_a_stop_that_arrives_while_another_client_rearms_stays() -> None:
     assert (bench.mode, bench.reason) == (ServoMode.STOPPED, "the second")
 
 
-def test_an_unforeseen_error_is_the_error_of_its_request_alone(
-    guard: Guard, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_unforeseen_error_is_the_error_of_its_request_alone(guard: Guard, monkeypatch: pytest.MonkeyPatch) -> None:
     bench = Bench(guard=guard)
     bench.servo.stream(move(until_s=0.5))
     bench.run(0.2)

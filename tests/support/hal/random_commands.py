@@ -289,7 +289,9 @@ def check_setpoints(client: CarelessClient, limits: ServoLimits | None = None) -
         too_fast=int((np.abs(dq) > 1.0011 * limits.dq_max).any(axis=1).sum()),
         beyond_acceleration=int((np.abs(ddq[1:]) > TOLERANCE * ddq_max).any(axis=1).sum()),
         beyond_jerk=int((np.abs(dddq) > TOLERANCE * dddq_max).any(axis=1).sum()),
-        still_moving=int((client.is_at_rest and bool((np.abs(dq[-1]) > 1e-6).any())) or client.stopped > client.is_at_rest),
+        still_moving=int(
+            (client.is_at_rest and bool((np.abs(dq[-1]) > 1e-6).any())) or client.stopped > client.is_at_rest
+        ),
     )
 
 
