@@ -1,9 +1,9 @@
 """Command mailbox between the producers' threads and the tick: lease, trajectory queue, single setpoint, latched stop.
 
-Any thread calls the methods, which take `_lock` to keep the producers apart. The tick and `stop` take no lock: they read
-and replace whole attributes that hold immutable objects (`trajectory`, `target`, `latch`), which Python does atomically,
-and `played_id` has one writer, the tick. A stop therefore takes effect at the next tick whatever else is running, also
-while a chunk is being checked.
+Any thread calls the methods, which take `_lock` to keep the producers apart. The tick and `stop` take no lock: they
+read and replace whole attributes that hold immutable objects (`trajectory`, `target`, `latch`), which Python does
+atomically, and `played_id` has one writer, the tick. A stop therefore takes effect at the next tick whatever else is
+running, also while a chunk is being checked.
 """
 
 from __future__ import annotations

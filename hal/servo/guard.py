@@ -129,7 +129,7 @@ def measure_margins(q, joints, lower, upper, T_flange_pivot):
 
 
 @njit(cache=True, nogil=True)
-def find_first_outside(q, q_now, joints, lower, upper, T_flange_pivot, allowed):
+def find_first_outside(q, q_now, joints, lower, upper, T_flange_pivot, allowed):  # noqa: PLR0917 - as `measure_margins`
     """Return index, boundary and margin [m] of the first of the postures `q` (N, 7) that is outside; index −1 if none.
 
     `allowed` (3,) are the margins that each boundary needs [m]; less is allowed where `q_now` (7,) has less already.

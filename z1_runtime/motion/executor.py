@@ -1,4 +1,4 @@
-"""Execution of planned motions: chunks streamed to the servo a fifth of a second ahead, and checks of its progress."""
+"""Execution of planned motions: chunks streamed to the servo ahead of its progress, and checks of that progress."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hal.base import z1
-from hal.base.clock import Clock
+from hal.base.clock import Clock, WallClock
 from hal.base.errors import InvalidValueError, Z1Error
 from hal.base.messages import ArmState, ServoStatus, TrajectoryChunk
+from z1_runtime.motion.sender import AdaptiveLead, ChunkSender, SenderConfig, SenderThread
 from z1_runtime.types import JointTrajectory
 
 if TYPE_CHECKING:
@@ -28,15 +29,9 @@ class MotionError(Z1Error, RuntimeError):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ExecutorConfig:
-    """Timing of the transfer of trajectories to the servo."""
+class ExecutorConfig(SenderConfig):
+    """Timing of motions and of their transfer to the servo."""
 
-    lead_s: float = 0.2
-    """Duration of the motion that waits at the servo [s]; after the runtime's end the arm moves no longer than this."""
-    chunk_s: float = 0.1
-    """Length of one message [s]."""
-    poll_s: float = 0.02
-    """Period at which the servo's progress is read [s]."""
     stall_timeout_s: float = 1.0
     """Maximum time without progress of a motion before it counts as lost [s]."""
     settle_dq: float = 0.02
@@ -45,10 +40,7 @@ class ExecutorConfig:
     """Maximum time that a motion takes to come to rest after its end [s]."""
 
     def __post_init__(self) -> None:
-        if not 0 < self.poll_s < self.chunk_s < self.lead_s:
-            raise InvalidValueError(
-                f"ExecutorConfig needs 0 < poll_s < chunk_s < lead_s; got {self.poll_s}, {self.chunk_s}, {self.lead_s}."
-            )
+        SenderConfig.__post_init__(self)
         for name in ("stall_timeout_s", "settle_dq", "settle_timeout_s"):
             if not 0 < getattr(self, name) < np.inf:
                 raise InvalidValueError(f"{name} is {getattr(self, name)}; it must be positive and finite.")
@@ -58,12 +50,17 @@ Watcher = Callable[[ArmState, ServoStatus], None]
 
 
 class Executor:
-    """Plays trajectories on a `ServoedArm` whose lease is held."""
+    """Plays trajectories on a `ServoedArm` whose lease is held.
+
+    On the wall clock a thread of its own sends the chunks; in lock-step, where time stands still between two sleeps of
+    the caller, they are sent inline, and the same calls give the same bytes.
+    """
 
     def __init__(self, arm: ServoedArm, clock: Clock, config: ExecutorConfig | None = None) -> None:
         self._arm = arm
         self._clock = clock
         self._config = config or ExecutorConfig()
+        self._lead = AdaptiveLead(self._config)
         self.watchers: list[Watcher] = []
         """Called with the arm's state at every poll, for logs; must return at once."""
 
@@ -77,7 +74,18 @@ class Executor:
         """
         trajectory_id = self._arm.status().trajectory_id + 1
         chunks = _chunks(trajectory, trajectory_id, self._config.chunk_s)
-        sent_s, played_s = 0.0, 0.0
+        sender = ChunkSender(self._arm, chunks, self._config, self._lead)
+        if not isinstance(self._clock, WallClock):
+            self._await_end(trajectory, trajectory_id, sender.send_due)
+            return
+        with SenderThread(sender, self._clock) as thread:
+            self._await_end(trajectory, trajectory_id, lambda _: thread.raise_error())
+
+    def _await_end(
+        self, trajectory: JointTrajectory, trajectory_id: int, send_due: Callable[[ServoStatus], None]
+    ) -> None:
+        """Wait for the end of a motion; call `send_due` at every poll."""
+        played_s = 0.0
         moved_s = self._clock.now_s()
         while True:
             status = self._poll()
@@ -95,11 +103,7 @@ class Executor:
                 played_s, moved_s = status.trajectory_time_s, self._clock.now_s()
             elif self._clock.now_s() - moved_s > self._config.stall_timeout_s:
                 raise MotionError(_describe_stall(status, trajectory_id, played_s), code="stalled")
-            # No more than the lead: the arm plays what it has, also after the runtime's end
-            while chunks and sent_s - played_s < self._config.lead_s:
-                chunk = chunks.popleft()
-                self._arm.stream(chunk)
-                sent_s = float(chunk.t_s[-1])
+            send_due(status)
             # In lock-step, time moves only while a caller sleeps
             self._clock.sleep_until(self._clock.now_s() + self._config.poll_s)
 
