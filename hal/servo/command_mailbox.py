@@ -24,9 +24,6 @@ from hal.servo.trajectory_buffer import TrajectoryBuffer, extend_buffer, start_b
 _CHECK_EVERY_S = 0.01
 """Time between two postures that the guard checks [s]: at full speed a joint turns 0.03 rad in it."""
 
-_MAX_ID_STEP = 1_000_000
-"""Maximum distance between the numbers of two trajectories: one huge number would leave none for the next client."""
-
 
 class Snapshot(NamedTuple):
     """The result of a tick for all other threads; replaced as a whole."""
@@ -161,12 +158,6 @@ class CommandMailbox:
                     f"servo: trajectory {chunk.trajectory_id} is over ({snapshot.reason or 'played or replaced'}). "
                     f"Start a new one, number {newest + 1} or above.",
                     code="stale_trajectory",
-                )
-            if chunk.trajectory_id > newest + _MAX_ID_STEP:
-                raise CommandRejectedError(
-                    f"servo: trajectory {chunk.trajectory_id} is far from the last one (allowed {newest + 1} to "
-                    f"{newest + _MAX_ID_STEP}). Number trajectories from the status's.",
-                    code="invalid_trajectory_id",
                 )
             self._check_start(chunk, snapshot)
             new = start_buffer(chunk, self._limits)
