@@ -37,17 +37,16 @@ def access_control(robot: str, clients: Mapping[str, str] | None, own_name: str 
         clients: role of each certificate's common name; None without TLS, when every client has the operator's role.
         own_name: common name of the HAL's own certificate, with which the twin serves its ground truth.
     """
-    questions, evaluation = (keys.HELLO, keys.STOP, keys.READ_STATUS), f"{keys.EVALUATION}/*"
-    commands = (keys.CLAIM, keys.RELEASE, keys.CHUNK, keys.SEND, keys.REARM)
+    evaluation = f"{keys.EVALUATION}/*"
     viewing = [
-        _rule("ask", _IN, ["query"], [*questions, evaluation], robot),
+        _rule("ask", _IN, ["query"], [*keys.QUESTIONS, evaluation], robot),
         _rule("listen", _IN, ["declare_subscriber"], keys.PUBLISHED, robot),
         _rule("publish", _OUT, ["put"], keys.PUBLISHED, robot),
-        _rule("answer", _OUT, ["reply", "declare_queryable"], [*questions, evaluation], robot),
+        _rule("answer", _OUT, ["reply", "declare_queryable"], [*keys.QUESTIONS, evaluation], robot),
     ]
     commanding = [
-        _rule("command", _IN, ["query"], commands, robot),
-        _rule("command answer", _OUT, ["reply", "declare_queryable"], commands, robot),
+        _rule("command", _IN, ["query"], keys.COMMANDS, robot),
+        _rule("command answer", _OUT, ["reply", "declare_queryable"], keys.COMMANDS, robot),
         _rule("heartbeat", _IN, ["put"], [keys.HEARTBEAT], robot),
         _rule("heartbeat wanted", _OUT, ["declare_subscriber"], [keys.HEARTBEAT], robot),
     ]

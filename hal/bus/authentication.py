@@ -94,8 +94,8 @@ class Request:
             return Request(key=key, payload=payload, name=name.decode(), nonce=nonce, counter=counter, code=code)
         except (struct.error, ValueError) as err:
             raise InvalidMessageError(
-                f"bus: the attachment of a request to {key} has {len(attachment)} bytes and no name in UTF-8 behind "
-                f"{_STAMP.size} of them ({err}). Use the same version on both ends.",
+                f"bus: the attachment of a request to {key} is unreadable ({len(attachment)} bytes). Use the same "
+                f"version on both ends.",
                 code="invalid_request",
             ) from err
 

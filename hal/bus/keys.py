@@ -29,7 +29,11 @@ REARM = "srv/rearm"
 READ_STATUS = "srv/status"
 """Answers with the `ServoStatus` of this moment."""
 
-SERVICES = (HELLO, CLAIM, RELEASE, CHUNK, SEND, STOP, REARM, READ_STATUS)
+COMMANDS = (CLAIM, RELEASE, CHUNK, SEND, REARM)
+"""Services that need an operator's role."""
+QUESTIONS = (HELLO, STOP, READ_STATUS)
+"""Services for every client."""
+SERVICES = (*QUESTIONS, *COMMANDS)
 PUBLISHED = (STATE, STATUS, HEALTH, FRAME)
 """Topics of the HAL."""
 EVALUATION = "eval"

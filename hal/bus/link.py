@@ -99,7 +99,7 @@ class BusLink:
         # No reply at once: no service exists. No reply after the timeout: the other end of Zenoh gave up first.
         if self._clock.now_s() - sent_s > 0.5 * self._config.request_timeout_s:
             raise self._no_answer(key)
-        if self._config.keys and self._greeted:
+        if self._config.keys and self._greeted and key in keys.COMMANDS:
             raise LeaseError(
                 f"bus: no answer to {key}: the role of the certificate in {self._config.keys} does not allow it, or "
                 f"the HAL has ended. Use an operator's keys.",
@@ -125,9 +125,10 @@ class BusLink:
         unlink_segments(self._segments)
 
     def _no_answer(self, key: str) -> HalTimeoutError:
+        remedy = "Use the switch on the arm." if key == keys.STOP else "Check its log."
         return HalTimeoutError(
             f"bus: the HAL process at {self._config.endpoint} gave no answer to {key} within "
-            f"{self._config.request_timeout_s} s. Check its log.",
+            f"{self._config.request_timeout_s} s. {remedy}",
             code="no_answer",
         )
 

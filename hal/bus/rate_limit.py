@@ -43,7 +43,7 @@ class TokenBucket:
 
 
 class LimitedLog:
-    """A logger's warnings of one kind, at most one a second; the next one counts those left out.
+    """A logger's warnings of one kind, at most one in ten seconds; the next one counts those left out.
 
     Args:
         log: the module's logger.
@@ -52,7 +52,7 @@ class LimitedLog:
 
     def __init__(self, log: logging.Logger, clock: Clock | None = None) -> None:
         self._log = log
-        self._bucket = TokenBucket(1.0, 3.0, clock or WallClock())
+        self._bucket = TokenBucket(0.1, 3.0, clock or WallClock())
         self._left_out = 0
 
     def warning(self, text: str, *arguments: object) -> None:

@@ -57,7 +57,7 @@ def make_runtime_folder() -> Path:
 
 def find_file(name: str) -> Path | None:
     """Return the file or socket `name` of this user's HAL; None when there is none that only this user can open."""
-    for folder in runtime_folders():
+    for folder in runtime_folders() if Path(name).name == name else ():
         try:
             safe = _is_private(folder.lstat(), stat.S_ISDIR) and _is_private((folder / name).lstat(), _is_file)
         except OSError:

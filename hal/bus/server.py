@@ -16,9 +16,10 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from importlib.metadata import version
 from threading import Event
-from typing import Protocol
+from typing import Any, Protocol
 
 import zenoh
 
@@ -42,6 +43,7 @@ _ANONYMOUS = "an anonymous client"
 _FRAME_TIMEOUT_S = 1.0
 _RETRY_S = 0.2  # pause after a camera error, so that a camera that fails at once does not occupy a core
 _HEALTH_PERIOD_S = 1.0
+_MAX_STOPS_HZ = 50.0  # once one is latched the next ones change nothing, and any program can send them
 _HEARTBEATS_WAITING = 16  # 0.3 s at 50 Hz, twice the heartbeat's timeout
 
 
@@ -87,21 +89,24 @@ class HalServer:
         # Before the session: a client that can connect finds the secret.
         self._secret = NO_SECRET if config.keys else make_secret(config.port)
         shared = config.shared_memory and has_shared_memory()
-        before = existing_segments()
-        self._session = open_session(config, listen=True, shared_memory=shared)
-        self._segments = mapped_segments() - before
-        try:
+        with ExitStack() as undo:
+            self._buffers = FrameBuffers(camera.intrinsics, shared=shared)
+            undo.callback(self._buffers.close)
+            before = existing_segments()
+            self._session = open_session(config, listen=True, shared_memory=shared)
+            undo.callback(self._session.close)
+            self._segments = mapped_segments() - before
             self._stop_socket = StopSocket(config.robot, config.port, servo.stop, self._read_stop_answer)
-        except HalError:
-            self._session.close()
-            raise
-        self._buffers = FrameBuffers(camera.intrinsics, shared=shared)
+            undo.pop_all()
         self._authority = LeaseAuthority()
         self._unreadable_reasons = LimitedLog(_LOG)
         self._threads: list[ServiceThread] = []
         self._start_publishing()
+        any_client: dict[str, Any] = {"rate_hz": _MAX_STOPS_HZ, "allow_anonymous": True}
         self._services = [
-            Service(self._session, key, handle, self.failed.set, self._secret, allow_anonymous=key == keys.STOP)
+            Service(
+                self._session, key, handle, self.failed.set, self._secret, **(any_client if key == keys.STOP else {})
+            )
             for key, handle in self._request_handlers()
         ]
 
@@ -254,10 +259,6 @@ class HalServer:
         def send(request: Request) -> bytes:
             return encode(servo.send(decode(request.payload, ArmSetpoint), owner=owner_of(request)))
 
-        def stop(request: Request) -> bytes:
-            servo.stop(self._decode_reason(request.payload) or f"stop requested by {request.name or _ANONYMOUS}")
-            return b""
-
         def rearm(request: Request) -> bytes:
             servo.rearm(owner_of(request))
             return encode(servo.status())
@@ -267,7 +268,7 @@ class HalServer:
             return encode(servo.status())
 
         return [
-            (keys.STOP, stop),
+            (keys.STOP, self._stop),
             (keys.CLAIM, claim),
             (keys.RELEASE, release),
             (keys.CHUNK, stream),
@@ -276,6 +277,10 @@ class HalServer:
             (keys.READ_STATUS, status),
             (keys.HELLO, self._hello),  # last: a client that gets its answer finds all other services running
         ]
+
+    def _stop(self, request: Request) -> bytes:
+        self._servo.stop(self._decode_reason(request.payload) or f"stop requested by {request.name or _ANONYMOUS}")
+        return b""
 
     def _hello(self, request: Request) -> bytes:
         self._check_user(request)

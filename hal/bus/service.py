@@ -25,8 +25,8 @@ _WAITING = 32
 _RATE_HZ, _BURST = 1000.0, 100.0
 """Messages that one service or topic takes a second: twice the fastest client's. A flood beyond it is left in the
 ring, so that it cannot take the interpreter from the servo."""
-_REJECTED_COST = 10.0
-"""Messages for which a rejected one counts: no honest client sends more than a few."""
+_REJECTED_COST = 50.0
+"""Messages for which a rejected one counts: 20 a second are answered, and no honest client sends more."""
 
 RequestHandler = Callable[[Request], bytes]
 """Returns the answer's payload; a `HalError` travels back as itself."""
@@ -114,6 +114,7 @@ class Service:
         handle: answers a query.
         on_failure: called when an unexpected error ends the thread.
         secret: the link's, which signs the answers (`hal.bus.link.link_secret`).
+        rate_hz: number of queries answered a second.
         allow_anonymous: also serve a query whose attachment is unreadable (the stop).
     """
 
@@ -125,6 +126,7 @@ class Service:
         on_failure: Callable[[], None],
         secret: bytes,
         *,
+        rate_hz: float = _RATE_HZ,
         allow_anonymous: bool = False,
     ) -> None:
         self._key = key
@@ -132,7 +134,7 @@ class Service:
         self._secret = secret
         self._allow_anonymous = allow_anonymous
         self._closing = Event()
-        self._bucket = TokenBucket(_RATE_HZ, _BURST, WallClock())
+        self._bucket = TokenBucket(rate_hz, _BURST, WallClock())
         self._rejections = LimitedLog(_LOG)
         # A ring, not a FIFO: a full FIFO would block the thread that receives for the whole session.
         self._queryable = session.declare_queryable(key, zenoh.handlers.RingChannel(_WAITING))

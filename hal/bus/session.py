@@ -184,9 +184,10 @@ def open_session(config: BusConfig, *, listen: bool, shared_memory: bool = False
 
 def no_answer_error(config: BusConfig) -> HalTimeoutError:
     """Return the error for a link without a HAL process at the other end."""
+    hint = " Or it rejects this certificate, or the address is not in its own." if config.keys else ""
     return HalTimeoutError(
         f"bus: no HAL process answers at {config.endpoint} for robot {config.robot!r}. "
-        f"Start it with `./z1 hal --sim`, or check `--port` and the robot's name.",
+        f"Start it with `./z1 hal --sim`, or check `--port` and the robot's name.{hint}",
         code="no_hal",
     )
 

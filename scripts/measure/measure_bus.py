@@ -75,9 +75,7 @@ def _add(table: Table, name: str, values: np.ndarray) -> None:
 @contextmanager
 def hal_process() -> Iterator[BusConfig]:
     """Run `serve_mock` in a process of its own on a free port."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))  # 0: a free port of the system's choice
-        port = probe.getsockname()[1]
+    port = free_port()
     command = [sys.executable, "-c", f"from scripts.measure.measure_bus import serve_mock; serve_mock({port})"]
     with subprocess.Popen(command, stdout=subprocess.PIPE) as process:
         try:
@@ -87,6 +85,13 @@ def hal_process() -> Iterator[BusConfig]:
             yield BusConfig(port=port)
         finally:
             process.send_signal(signal.SIGTERM)
+
+
+def free_port() -> int:
+    """Return a TCP port of the loopback that is free now."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))  # 0: of the system's choice
+        return probe.getsockname()[1]
 
 
 def serve_mock(port: int) -> None:

@@ -1,9 +1,12 @@
 """The ground truth service over a real link."""
 
+import shutil
 import socket
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,9 +18,11 @@ from hal.base.errors import HalTimeoutError
 from hal.bus.server import HalServer
 from hal.bus.session import BusConfig
 from hal.servo.servo import Servo
+from scripts.support.certificates import add_client, make_keys
 from sim_twin.ground_truth import GroundTruthClient, GroundTruthServer, read_ground_truth
 from sim_twin.model.world import World
 from tests.support.errors import raises
+from tests.support.ports import free_tcp_port
 
 
 @pytest.fixture
@@ -51,6 +56,25 @@ def test_without_a_twin_there_is_a_clear_error(bus: BusConfig, world: World) -> 
     GroundTruthServer(bus, world).close()
     with GroundTruthClient(bus) as client, raises(HalTimeoutError, "no_twin"):
         client.read()
+
+
+@pytest.mark.integration
+@pytest.mark.skipif(shutil.which("openssl") is None, reason="makes certificates with openssl")
+def test_the_truth_crosses_a_link_with_keys(world: World, tmp_path: Path) -> None:
+    make_keys(tmp_path / "keys", [], days=2)
+    viewer = add_client(tmp_path / "keys", "ann", "viewer", days=2)
+    hal = BusConfig(port=free_tcp_port(), keys=str(tmp_path / "keys/hal"))
+    clock = WallClock()
+    servo, camera = Servo(MockArm(clock), clock), ReplayCamera(clock=clock)
+    servo.connect()
+    camera.connect()
+    with HalServer(servo, camera, clock, hal):
+        server = GroundTruthServer(hal, world)
+        with GroundTruthClient(replace(hal, keys=str(viewer))) as client:
+            assert client.read().object == "bottle"
+        server.close()
+    camera.disconnect()
+    servo.disconnect()
 
 
 @pytest.mark.integration

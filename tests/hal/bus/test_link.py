@@ -417,6 +417,15 @@ def test_an_unreadable_request_is_rejected_everywhere_but_at_the_stop(hal, intru
     assert "stop requested" in hal.servo.status().reason
 
 
+def test_malformed_requests_in_great_number_write_few_lines(hal, intruder, caplog):
+    with caplog.at_level(logging.WARNING):
+        for _ in range(40):
+            for key in (keys.CLAIM, keys.STOP):
+                list(intruder.get(key, payload=b"\xff" * 3000, timeout=5.0))
+    for text in ("malformed", "unreadable reason"):
+        assert 1 <= sum(text in record.getMessage() for record in caplog.records) <= 5
+
+
 def test_an_unforeseen_error_is_the_error_of_one_request(hal, remote_arm, monkeypatch):
     def broken_claim(owner: str) -> None:
         raise ZeroDivisionError("on purpose")

@@ -5,12 +5,14 @@ from __future__ import annotations
 import os
 import socket
 import stat
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from hal.base.errors import CommandRejectedError, HalError, HalTimeoutError
 from hal.base.messages import ServoMode
+from hal.bus.client import RemoteArm
 from hal.bus.runtime_files import find_file, make_runtime_folder, make_secret, read_secret, runtime_folders
 from hal.bus.stop_socket import StopAnswer, StopClient, StopSocket
 from tests.support.errors import raises
@@ -101,6 +103,18 @@ def test_the_hal_stops_by_its_socket_while_silent_connections_fill_the_port(hal)
         wait_until(lambda: client.read_status().mode == ServoMode.STOPPED.value)
         assert hal.servo.status().reason == "in a crowd"
         client.close()
+    finally:
+        for connection in silent:
+            connection.close()
+
+
+def test_a_client_connects_while_silent_connections_wait(hal):
+    address = ("127.0.0.1", hal.config.port)
+    silent = [socket.create_connection(address, timeout=5.0) for _ in range(300)]
+    try:
+        with RemoteArm(replace(hal.config, connect_timeout_s=10.0)) as arm:
+            arm.stop("over the link")
+        assert hal.servo.status().reason == "over the link"
     finally:
         for connection in silent:
             connection.close()

@@ -155,6 +155,33 @@ def test_only_the_owner_commands() -> None:
     bench.servo.stream(move(), owner="test")
 
 
+def test_rearm_needs_the_lease_as_a_command_does() -> None:
+    bench = Bench()
+    bench.servo.stop("inspect it")
+    bench.run(0.1)
+    with raises(LeaseError, "owned_by_other"):
+        bench.servo.rearm("another")
+    assert bench.mode is ServoMode.STOPPED
+    bench.servo.rearm("test")
+    bench.run(0.1)
+    assert bench.mode is HOLDING
+    assert bench.servo.status().owner == ""
+    with raises(LeaseError, "not_claimed"):
+        bench.servo.rearm("test")
+
+
+def test_while_the_stop_is_latched_another_client_can_claim_the_lease_and_rearm() -> None:
+    bench = Bench()
+    bench.servo.stop("inspect it")
+    bench.run(0.1)
+    bench.servo.claim("another")
+    with raises(LeaseError, "owned_by_other"):
+        bench.servo.rearm("test")
+    bench.servo.rearm("another")
+    bench.run(0.1)
+    assert bench.mode is HOLDING
+
+
 def test_a_command_without_a_lease_is_rejected() -> None:
     bench = Bench()
     bench.servo.release()
