@@ -11,6 +11,7 @@ from hal.base.arm import Arm
 from hal.base.camera import Camera
 from hal.base.clock import Clock
 from hal.base.errors import InvalidValueError, UnknownBackendError
+from hal.base.messages import ArmState
 
 if TYPE_CHECKING:
     from hal.parking import Parking
@@ -68,6 +69,7 @@ CAMERAS: Registry[Camera] = Registry(
     "camera",
     {
         "d405": "hal.backends.d405.camera:D405Camera",
+        "none": "hal.backends.no_camera:NoCamera",
         "replay": "hal.backends.replay_camera:ReplayCamera",
         "sim": "sim_twin.backends:TwinCamera",
     },
@@ -84,8 +86,12 @@ class Rig:
     call_every_tick: Callable[[Callable[[], None]], None] | None = None
     """In lock-step: registers a callback that the clock calls every control period while a thread sleeps on it. None on
     the wall clock, where `hal.servo.servo_thread.ServoThread` ticks."""
-    independent: bool = False
-    """True when arm and camera are separate devices, which can be connected at the same time."""
+    find_arm: Callable[[], None] | None = None
+    """Looks for the arm and changes nothing at it; raises what its `connect` would. None where it is always there."""
+    give_back: Callable[[], None] | None = None
+    """Returns the connected arm to the state in which it was found, after a start that failed; None = it holds."""
+    follow_arm: Callable[[Callable[[], ArmState]], None] | None = None
+    """Gives a camera that renders the arm the source of its measurements; None = it has its own."""
     park: Parking | None = None
     """Parking of the arm at the end of a HAL process; None = the arm holds its position."""
     world: Any = None

@@ -7,6 +7,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from hal.backends.no_camera import NoCamera
 from hal.base.arm import ServoedArm
 from hal.base.camera import Camera
 from hal.base.clock import Clock, WallClock
@@ -44,11 +45,13 @@ def connect_rig(rig: Rig, *, camera: bool = True) -> Iterator[Devices]:
 
     servo = Servo(rig.arm, rig.clock, guard=Guard())
     with ExitStack() as stack:
+        stack.callback(rig.camera.disconnect)
+        if camera:  # first: a missing one leaves the arm as it is
+            rig.camera.connect()
         servo.connect()
         stack.callback(servo.disconnect)
-        if camera:
-            rig.camera.connect()
-        stack.callback(rig.camera.disconnect)
+        if rig.follow_arm is not None:
+            rig.follow_arm(servo.read_state)
         if rig.call_every_tick is not None:
             rig.call_every_tick(servo.tick)
         else:
@@ -65,8 +68,13 @@ def connect_rig(rig: Rig, *, camera: bool = True) -> Iterator[Devices]:
 
 
 @contextmanager
-def connect_remote(bus: BusConfig, owner: str) -> Iterator[Devices]:
+def connect_remote(bus: BusConfig, owner: str, *, camera: bool = True) -> Iterator[Devices]:
     """Yield the devices of the HAL process at `bus`; its lease is free until `owner` claims it.
+
+    Args:
+        bus: address of the HAL process.
+        owner: name of this client.
+        camera: False for the arm alone, as of a HAL process without a camera.
 
     Raises:
         HalTimeoutError: no HAL process answers.
@@ -76,5 +84,9 @@ def connect_remote(bus: BusConfig, owner: str) -> Iterator[Devices]:
 
     clock = WallClock()
     # Disconnecting releases the lease, also after the HAL process has ended.
-    with RemoteArm(bus, owner, clock) as arm, RemoteCamera(bus, clock) as camera:
-        yield Devices(arm=arm, camera=camera, clock=clock)
+    with RemoteArm(bus, owner, clock) as arm:
+        if not camera:
+            yield Devices(arm=arm, camera=NoCamera(), clock=clock)
+            return
+        with RemoteCamera(bus, clock) as remote_camera:
+            yield Devices(arm=arm, camera=remote_camera, clock=clock)

@@ -124,12 +124,15 @@ class Robot:
         )
 
     @classmethod
-    def connect(cls, bus: BusConfig | None = None, *, owner: str = "runtime", **options: Any) -> Self:
+    def connect(
+        cls, bus: BusConfig | None = None, *, owner: str = "runtime", camera: bool = True, **options: Any
+    ) -> Self:
         """Return the robot of a running HAL process (`./z1 hal`), on this machine or another.
 
         Args:
             bus: address of the HAL process.
             owner: see the class.
+            camera: False for the arm alone, which moves and cannot pick.
             **options: the other arguments of the class.
 
         Raises:
@@ -137,7 +140,7 @@ class Robot:
         """
         from hal.bus.session import BusConfig
 
-        return cls(connect_remote(bus or BusConfig(), owner), owner=owner, **options)
+        return cls(connect_remote(bus or BusConfig(), owner, camera=camera), owner=owner, **options)
 
     @property
     def arm(self) -> ServoedArm:
@@ -244,9 +247,7 @@ class Robot:
         if not drop:
             check_empty(self.state(), self.config, "pick")
 
-    def pick(
-        self, object_class: str | None = None, *, attempts: int | None = None, drop: bool = False
-    ) -> PickResult:
+    def pick(self, object_class: str | None = None, *, attempts: int | None = None, drop: bool = False) -> PickResult:
         """Pick an object from the home posture, and hold it up.
 
         Args:

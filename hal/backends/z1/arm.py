@@ -64,6 +64,7 @@ class Z1Arm:
         self._commands = CommandWriter(self._client, self.limits)
         self._modes = ModeMachine(self._client, self._commands, self.config.connect_timeout_s)
         self._motions = ControllerMotions(self._client, self._modes, self._lock)
+        self._found = Fsm.INVALID
 
     # --- Connection ---------------------------------------------------------------------------------------------
 
@@ -80,14 +81,15 @@ class Z1Arm:
                 return
             client = self._client
             client.open(self.config.connect_timeout_s)
-            found = client.newest.state
+            self._found = client.newest.state
             self._commands.grip_nm = None  # torque control of an earlier connection must not persist
             try:
                 self._modes.start(self.config.mode)
             except HalError:
+                self._return_to_found_state()
                 client.close()
                 raise
-            log.info("Z1: connected to %s, which was in %s", client.link.describe(), found.name)
+            log.info("Z1: connected to %s, which was in %s", client.link.describe(), self._found.name)
 
     def disconnect(self) -> None:
         with self._lock:
@@ -98,6 +100,24 @@ class Z1Arm:
             except HalError as error:
                 log.warning("Z1: disconnected without an answer: %s", error)
             self._client.close()
+
+    def give_back(self) -> None:
+        """Return the arm to the state in which `connect` found it, and only observe it from now on.
+
+        Without stiffness (PASSIVE) if it was so; from every other state it goes on holding where it is.
+        """
+        with self._lock:
+            self._modes.require_connection()
+            self._return_to_found_state()
+
+    def _return_to_found_state(self) -> None:
+        if self._found is not Fsm.PASSIVE or self._client.newest.state is Fsm.PASSIVE:
+            return
+        try:
+            self._client.request_state(Fsm.PASSIVE)
+            self._modes.observe()
+        except HalError as error:
+            log.error("Z1: the arm was found without stiffness, and could not be returned to it: %s", error)
 
     # --- The contract -------------------------------------------------------------------------------------------
 
