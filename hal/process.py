@@ -7,7 +7,6 @@ import logging
 import os
 import signal
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from threading import Event, Thread
 
@@ -91,19 +90,25 @@ def serve(
     servo = kind(rig.arm, rig.clock, limits, heartbeat_timeout_s=HEARTBEAT_TIMEOUT_S)
     ticking = ServoThread(servo, rig.clock, cpu=cpu)
     shutdown = _ShutdownSequence(servo, ticking, rig.park, force_exit_event or Event())
+    start = _Start(rig)
     with ExitStack() as undo:  # each step that was reached is undone, in reverse order
-        connect_devices(servo, rig)
-        undo.callback(servo.disconnect)
-        undo.callback(shutdown.disable_motors)  # undone after the last tick, see `ticking.stop` below
+        start.connect_camera()
         undo.callback(rig.camera.disconnect)
-        # After connecting: the guard takes a second to load, which a missing arm need not wait for.
+        # Before the arm, which must not wait for a second of loading without a client
         servo.set_safety_guard(Guard(workspace))
+        servo.connect()
+        undo.callback(servo.disconnect)
+        undo.callback(start.give_back)
+        undo.callback(shutdown.disable_motors)  # undone after the last tick, see `ticking.stop` below
+        if rig.follow_arm is not None:
+            rig.follow_arm(servo.read_state)
         ticking.start()
         undo.callback(ticking.stop)
         _await_first_tick(servo, ticking)
         server = undo.enter_context(HalServer(servo, rig.camera, rig.clock, config))
         if not monitor_only:
             undo.callback(shutdown.bring_to_rest)  # undone first, while the servo ticks and clients can stop it
+        start.finished = True
         _LOG.info("serving robot %s at %s", config.robot, config.endpoint)
         if on_ready is not None:
             on_ready()
@@ -127,32 +132,34 @@ def _await_first_tick(servo: Servo, ticking: ServoThread) -> None:
         pause.wait(CONTROL_PERIOD_S)
 
 
-def connect_devices(servo: Servo, rig: Rig) -> None:
-    """Connect arm and camera, at the same time where they are independent, so that both failures are reported together.
+class _Start:
+    """A start that changes nothing at the arm until every other device is there, and gives it back when it fails."""
 
-    Raises:
-        HalError: of the device that does not answer, or of both (`devices`); nothing is left open.
-    """
-    if not rig.independent:
-        servo.connect()
+    def __init__(self, rig: Rig) -> None:
+        self._rig = rig
+        self.finished = False
+        """True from when clients are served; the arm then ends as the shutdown says."""
+
+    def connect_camera(self) -> None:
+        """Connect the camera; where it is missing, look for the arm too, so that both are reported together.
+
+        Raises:
+            HalError: of the camera, or of both devices (`devices`); the arm was not touched.
+        """
         try:
-            rig.camera.connect()
-        except Exception:  # every type: the arm must not stay connected
-            servo.disconnect()
+            self._rig.camera.connect()
+        except HalError as missing:
+            try:
+                if self._rig.find_arm is not None:
+                    self._rig.find_arm()
+            except HalError as error:
+                raise HalError(f"arm: {error} camera: {missing}", code="devices") from error
             raise
-        return
-    with ThreadPoolExecutor(1, thread_name_prefix="connect camera") as pool:
-        camera = pool.submit(rig.camera.connect)
-        try:
-            servo.connect()
-        except HalError as error:
-            if camera.exception() is None:
-                rig.camera.disconnect()
-                raise
-            raise HalError(f"arm: {error} camera: {camera.exception()}", code="devices") from error
-        if camera.exception() is not None:
-            servo.disconnect()
-        camera.result()
+
+    def give_back(self) -> None:
+        """Return the arm to the state it was found in, unless the start was finished."""
+        if not self.finished and self._rig.give_back is not None:
+            self._rig.give_back()
 
 
 class _ShutdownSequence:

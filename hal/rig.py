@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from hal.base.clock import Clock, WallClock
 from hal.base.errors import InvalidValueError, UnknownBackendError
+from hal.base.messages import ArmState
 
 if TYPE_CHECKING:
     from hal.base.arm import Arm, ServoedArm
@@ -70,6 +71,7 @@ CAMERAS: Registry[Camera] = Registry(
     "camera",
     {
         "d405": "hal.backends.d405.camera:D405Camera",
+        "none": "hal.backends.no_camera:NoCamera",
         "replay": "hal.backends.replay_camera:ReplayCamera",
         "sim": "sim_twin.backends:TwinCamera",
     },
@@ -86,8 +88,12 @@ class Rig:
     call_every_tick: Callable[[Callable[[], None]], None] | None = None
     """In lock-step: registers a callback that the clock calls every control period while a thread sleeps on it. None on
     the wall clock, where `hal.servo.servo_thread.ServoThread` ticks."""
-    independent: bool = False
-    """True when arm and camera are separate devices, which can be connected at the same time."""
+    find_arm: Callable[[], None] | None = None
+    """Looks for the arm and changes nothing at it; raises what its `connect` would. None where it is always there."""
+    give_back: Callable[[], None] | None = None
+    """Returns the connected arm to the state in which it was found, after a start that failed; None = it holds."""
+    follow_arm: Callable[[Callable[[], ArmState]], None] | None = None
+    """Gives a camera that renders the arm the source of its measurements; None = it has its own."""
     park: Parking | None = None
     """Parking of the arm at the end of a HAL process; None = the arm holds its position."""
     world: Any = None
@@ -133,11 +139,13 @@ def connect_rig(rig: Rig, *, camera: bool = True) -> Iterator[Devices]:
 
     servo = Servo(rig.arm, rig.clock, guard=Guard())
     with ExitStack() as stack:
+        stack.callback(rig.camera.disconnect)
+        if camera:  # first: a missing one leaves the arm as it is
+            rig.camera.connect()
         servo.connect()
         stack.callback(servo.disconnect)
-        if camera:
-            rig.camera.connect()
-        stack.callback(rig.camera.disconnect)
+        if rig.follow_arm is not None:
+            rig.follow_arm(servo.read_state)
         if rig.call_every_tick is not None:
             rig.call_every_tick(servo.tick)
         else:
@@ -154,8 +162,13 @@ def connect_rig(rig: Rig, *, camera: bool = True) -> Iterator[Devices]:
 
 
 @contextmanager
-def connect_remote(bus: BusConfig, owner: str) -> Iterator[Devices]:
+def connect_remote(bus: BusConfig, owner: str, *, camera: bool = True) -> Iterator[Devices]:
     """Yield the devices of the HAL process at `bus`; its lease is free until `owner` claims it.
+
+    Args:
+        bus: address of the HAL process.
+        owner: name of this client.
+        camera: False for the arm alone, as of a HAL process without a camera.
 
     Raises:
         HalTimeoutError: no HAL process answers.
@@ -165,5 +178,11 @@ def connect_remote(bus: BusConfig, owner: str) -> Iterator[Devices]:
 
     clock = WallClock()
     # Disconnecting releases the lease, also after the HAL process has ended.
-    with RemoteArm(bus, owner, clock) as arm, RemoteCamera(bus, clock) as camera:
-        yield Devices(arm=arm, camera=camera, clock=clock)
+    with RemoteArm(bus, owner, clock) as arm:
+        if not camera:
+            from hal.backends.no_camera import NoCamera
+
+            yield Devices(arm=arm, camera=NoCamera(), clock=clock)
+            return
+        with RemoteCamera(bus, clock) as remote_camera:
+            yield Devices(arm=arm, camera=remote_camera, clock=clock)

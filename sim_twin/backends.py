@@ -77,12 +77,15 @@ class TwinArm:
     A setpoint takes effect after the scene's `arm_latency_s`, in whole setpoints; a stop at once.
 
     Args:
-        world: of the arm; by default one of its own with the default scene.
+        world: of the arm; by default one of its own.
         clock: a `TwinClock` of that world for lock-step (the default), any other for real time.
+        scene: of a world of its own; by default the default one.
     """
 
-    def __init__(self, world: World | None = None, clock: Clock | None = None) -> None:
-        self.world = world if world is not None else World(SceneConfig())
+    def __init__(
+        self, world: World | None = None, clock: Clock | None = None, *, scene: SceneConfig | None = None
+    ) -> None:
+        self.world = world if world is not None else World(scene or SceneConfig())
         self.clock: Clock = clock if clock is not None else TwinClock(self.world)
         self._lockstep = isinstance(self.clock, TwinClock)
         self._connected = False
@@ -153,13 +156,21 @@ class TwinCamera:
     Drawing happens in a thread of its own, as an OpenGL context belongs to one thread.
 
     Args:
-        world: in view; by default one of its own with the default scene.
+        world: in view; by default one of its own.
         clock: a `TwinClock` of that world for lock-step (the default), any other for real time.
         renderer: one of `sim_twin.camera.render.RENDERERS`; by default the environment's.
+        scene: of a world of its own; by default the default one.
     """
 
-    def __init__(self, world: World | None = None, clock: Clock | None = None, renderer: str | None = None) -> None:
-        self.world = world if world is not None else World(SceneConfig())
+    def __init__(
+        self,
+        world: World | None = None,
+        clock: Clock | None = None,
+        renderer: str | None = None,
+        *,
+        scene: SceneConfig | None = None,
+    ) -> None:
+        self.world = world if world is not None else World(scene or SceneConfig())
         self.clock: Clock = clock if clock is not None else TwinClock(self.world)
         self._kind = renderer
         self._thread: ThreadPoolExecutor | None = None
@@ -168,6 +179,11 @@ class TwinCamera:
         self._snapshot = mujoco.MjData(self.world.model)
         self._first_s = 0.0
         self._sequence = 0
+        self._read_arm: Callable[[], ArmState] | None = None
+
+    def follow(self, read_state: Callable[[], ArmState]) -> None:
+        """Draw the arm at the joints that `read_state` returns, from the next frame on; the objects stay in place."""
+        self._read_arm = read_state
 
     def connect(self) -> None:
         """Open the renderer and draw once, so that the first frame is as quick as the others.
@@ -250,6 +266,8 @@ class TwinCamera:
         return thread.submit(self._draw, renderer, sequence).result()
 
     def _draw(self, renderer: WristRenderer, sequence: int) -> View:
+        if self._read_arm is not None:
+            self.world.place_arm(self._read_arm().q)
         view, config = renderer.render(self.world.snapshot(self._snapshot)), self.world.config
         if not config.noise:
             return replace(view, z_m=d405.round_depth(view.z_m))

@@ -123,12 +123,15 @@ class Robot:
         )
 
     @classmethod
-    def connect(cls, bus: BusConfig | None = None, *, owner: str = "runtime", **options: Any) -> Self:
+    def connect(
+        cls, bus: BusConfig | None = None, *, owner: str = "runtime", camera: bool = True, **options: Any
+    ) -> Self:
         """Return the robot of a running HAL process (`./z1 hal`), on this machine or another.
 
         Args:
             bus: address of the HAL process.
             owner: see the class.
+            camera: False for the arm alone, which moves and cannot pick.
             **options: the other arguments of the class.
 
         Raises:
@@ -136,7 +139,7 @@ class Robot:
         """
         from hal.bus.session import BusConfig
 
-        return cls(connect_remote(bus or BusConfig(), owner), owner=owner, **options)
+        return cls(connect_remote(bus or BusConfig(), owner, camera=camera), owner=owner, **options)
 
     @property
     def arm(self) -> ServoedArm:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Protocol, runtime_checkable
 
-from hal.base.messages import Intrinsics, RgbdFrame
+from hal.base.messages import ArmState, Intrinsics, RgbdFrame
 
 
 @runtime_checkable
@@ -39,4 +40,13 @@ class Camera(Protocol):
             NotConnectedError: before `connect()`.
             HalTimeoutError: no frame arrived within `timeout_s` [s].
         """
+        ...
+
+
+@runtime_checkable
+class ArmFollower(Protocol):
+    """A simulated camera that renders an arm which another device moves."""
+
+    def follow(self, read_state: Callable[[], ArmState]) -> None:
+        """Render the joints that `read_state` returns, from the next frame on."""
         ...

@@ -64,6 +64,12 @@ class Config(PickOptions):
                 f"For other hardware run ./z1 hal --hal {self.rig.name}, and in another terminal ./z1 run.",
                 code="no_ground_truth",
             )
+        if self.rig.parts is not None or self.rig.no_camera:
+            raise InvalidValueError(
+                f"demo: needs the whole twin (arm {self.rig.arm or 'of the rig'}, camera {self.rig.camera or 'none'}). "
+                "Leave out --arm, --camera and --no-camera, or use ./z1 hal with them.",
+                code="no_ground_truth",
+            )
         if self.lockstep and self.rig.name != "sim":
             raise InvalidValueError(
                 f"demo: lock-step has no drivers to test ({self.rig.name}, allowed sim). Leave out --{self.rig.name}.",

@@ -5,6 +5,9 @@
     ./z1 hal --mock                     an arm without physics, for testing clients
     ./z1 hal --real                     the Z1 and the D405
     ./z1 hal --real --readonly          the same, monitored only: nothing is commanded
+    ./z1 hal --real --no-camera         the Z1 alone
+    ./z1 hal --arm z1 --camera sim      the Z1 under the twin's camera, which renders its measured joints
+    ./z1 hal --arm sim --camera d405    the twin's arm and the D405, which does not see it
 
 End it with Ctrl-C: it brakes, holds, and disconnects; the real arm is folded first, and its motors are disabled.
 """
@@ -21,14 +24,14 @@ from typing import Annotated
 
 import tyro
 
-from hal.backends.real_rig import SEARCH_S
+from hal.backends.mixed_rig import SEARCH_S, make_mixed_rig
 from hal.backends.z1.config import Z1ArmConfig, Z1Mode
 from hal.bus.session import BusConfig
 from hal.process import serve, stop_on_signals
-from hal.rig import RIGS, Rig
+from hal.rig import CAMERAS, RIGS, Rig
 from hal.servo.guard import Workspace
 from scripts.support.hal_process import READY, decode_options
-from scripts.support.rig_option import RigOption
+from scripts.support.rig_option import NO_CAMERA, RigOption
 from scripts.support.scene_options import SceneOptions
 
 TWINS = ("sim", "wire-sim")
@@ -103,16 +106,23 @@ def make_rig(config: Config) -> Rig:
         UnknownBackendError: no such rig.
         InvalidValueError: the scene is out of range.
     """
-    name = config.rig.name
+    rig = _make_whole_rig(config)
+    return replace(rig, camera=CAMERAS.make(NO_CAMERA, clock=rig.clock)) if config.rig.no_camera else rig
+
+
+def _make_whole_rig(config: Config) -> Rig:
+    name, parts = config.rig.name, config.rig.parts
     # Read-only holds for the driver as well as for the servo: no datagram of it may command the arm.
     arm = replace(config.arm, mode=Z1Mode.OBSERVE) if config.readonly else config.arm
-    if name not in TWINS:
-        return RIGS.make(name, arm=arm)  # the twin is not imported
+    if "sim" not in parts if parts else name not in TWINS:  # the twin is not imported
+        return make_mixed_rig(*parts, z1=arm) if parts else RIGS.make(name, arm=arm)
     from calibration.board.board import Board
     from scripts.support.calibration_robot import RobotOptions, make_print
 
     board = make_print(RobotOptions(), Board()) if config.board else None
     scene = config.scene.to_scene(board)
+    if parts:
+        return make_mixed_rig(*parts, scene=scene, z1=arm)
     return RIGS.make(name, scene=scene, **({"mode": arm.mode} if name == "wire-sim" else {}))
 
 

@@ -87,7 +87,8 @@ def make_wire_sim_rig(scene: SceneConfig | None = None, mode: Z1Mode = Z1Mode.TR
     command_port, state_port = free_ports()
     wire = WireConfig(host=_LOOPBACK, command_port=command_port, client_host=_LOOPBACK, state_port=state_port)
     twin = WireProcess(scene if scene is not None else SceneConfig(), wire)
-    return Rig(arm=WireSimArm(twin, clock, mode), camera=WireSimCamera(twin), clock=clock, world=twin)
+    arm = WireSimArm(twin, clock, mode)
+    return Rig(arm=arm, camera=WireSimCamera(twin), clock=clock, give_back=arm.give_back, world=twin)
 
 
 def free_ports() -> tuple[int, int]:

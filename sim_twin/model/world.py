@@ -179,6 +179,12 @@ class World(SceneView):
         while self.time_s < t_s - 1e-9:
             self.step()
 
+    def place_arm(self, q: np.ndarray) -> None:
+        """Put the joints at `q` (7,) [rad], at rest and without physics, in a world that no step moves."""
+        with self._lock:
+            self.data.qpos[: z1.N_JOINTS] = q
+            self.data.qvel[: z1.N_JOINTS] = 0.0
+
     def set_command(self, q: np.ndarray, dq: np.ndarray) -> None:
         """Set the servos' targets: positions (7,) [rad] and velocities (7,) [rad/s]."""
         with self._lock:

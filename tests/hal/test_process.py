@@ -11,8 +11,10 @@ from threading import Event
 
 import numpy as np
 import pytest
+from z1_runtime.devices import connect_remote
 
 from hal.backends.mock_arm import MockArm, make_rig
+from hal.backends.no_camera import NoCamera
 from hal.base.clock import WallClock
 from hal.base.errors import CameraError, HalError, HalTimeoutError, InvalidValueError, NotConnectedError
 from hal.bus import keys
@@ -21,6 +23,7 @@ from hal.bus.service import Listener
 from hal.bus.session import BusConfig, open_session
 from hal.parking import Parking
 from hal.process import serve
+from hal.rig import Rig
 from tests.support.errors import raises
 
 pytestmark = pytest.mark.integration
@@ -102,22 +105,47 @@ def test_an_error_in_a_thread_of_the_server_ends_the_process(monkeypatch: pytest
             serve(rig, config, Event(), on_ready=listen)
 
 
-@pytest.mark.parametrize("independent", [True, False])
-def test_a_missing_camera_leaves_no_arm_connected(monkeypatch: pytest.MonkeyPatch, independent: bool) -> None:
-    rig = replace(make_rig(), independent=independent)
+class WatchedArm(MockArm):
+    """An arm that keeps the names of the calls that concern its connection."""
+
+    def __init__(self) -> None:
+        super().__init__(WallClock())
+        self.calls: list[str] = []
+
+    def find(self) -> None:
+        self.calls.append("find")
+
+    def connect(self) -> None:
+        self.calls.append("connect")
+        super().connect()
+
+    def give_back(self) -> None:
+        self.calls.append("give back")
+
+    def disconnect(self) -> None:
+        self.calls.append("disconnect")
+        super().disconnect()
+
+
+def watched_rig() -> tuple[Rig, WatchedArm]:
+    arm = WatchedArm()
+    return replace(make_rig(), arm=arm, find_arm=arm.find, give_back=arm.give_back), arm
+
+
+def test_a_missing_camera_leaves_the_arm_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    rig, arm = watched_rig()
 
     def fail() -> None:
         raise CameraError("no camera is plugged in")
 
     monkeypatch.setattr(rig.camera, "connect", fail)
-    with pytest.raises(CameraError):
+    with raises(CameraError, "camera"):
         serve(rig, free_config(), Event())
-    with pytest.raises(NotConnectedError):
-        rig.arm.read_state()
+    assert arm.calls == ["find"]
 
 
 def test_without_arm_and_camera_both_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
-    rig = replace(make_rig(), independent=True)
+    rig, arm = watched_rig()
 
     def no_camera() -> None:
         raise HalTimeoutError("no camera at USB.")
@@ -126,15 +154,14 @@ def test_without_arm_and_camera_both_are_reported(monkeypatch: pytest.MonkeyPatc
         raise HalTimeoutError("no arm at 192.0.2.1.")
 
     monkeypatch.setattr(rig.camera, "connect", no_camera)
-    monkeypatch.setattr(rig.arm, "connect", no_arm)
     with raises(HalError, "devices") as caught:
-        serve(rig, free_config(), Event())
+        serve(replace(rig, find_arm=no_arm), free_config(), Event())
     assert str(caught.value) == "arm: no arm at 192.0.2.1. camera: no camera at USB."
+    assert arm.calls == []
 
 
-@pytest.mark.parametrize("independent", [True, False])
-def test_a_missing_arm_leaves_no_camera_connected(monkeypatch: pytest.MonkeyPatch, independent: bool) -> None:
-    rig = replace(make_rig(), independent=independent)
+def test_a_missing_arm_leaves_no_camera_connected(monkeypatch: pytest.MonkeyPatch) -> None:
+    rig = make_rig()
 
     def no_arm() -> None:
         raise HalTimeoutError("no arm at 192.0.2.1.")
@@ -144,6 +171,38 @@ def test_a_missing_arm_leaves_no_camera_connected(monkeypatch: pytest.MonkeyPatc
         serve(rig, free_config(), Event())
     with pytest.raises(NotConnectedError):
         rig.camera.wait_for_frame(0.1)
+
+
+def test_a_start_that_fails_after_the_arm_was_connected_gives_it_back() -> None:
+    rig, arm = watched_rig()
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        with pytest.raises(HalError):
+            serve(rig, BusConfig(port=taken.getsockname()[1]), Event())
+    assert arm.calls == ["connect", "give back", "disconnect"]
+
+
+def test_an_end_after_the_start_does_not_give_the_arm_back() -> None:
+    rig, arm = watched_rig()
+    end = Event()
+    serve(rig, free_config(), end, on_ready=end.set)
+    assert arm.calls == ["connect", "disconnect"]
+
+
+def test_an_arm_alone_is_served_and_a_frame_is_an_error_of_the_camera() -> None:
+    rig, end, config = replace(make_rig(), camera=NoCamera()), Event(), free_config()
+    seen = []
+
+    def move() -> None:
+        with connect_remote(config, "alone", camera=False) as devices:
+            seen.append(devices.arm.read_state().q.shape)
+            with raises(CameraError, "no_camera"):
+                devices.camera.wait_for_frame(0.1)
+        end.set()
+
+    serve(rig, config, end, on_ready=move)
+    assert seen == [(7,)]
 
 
 def test_the_motors_of_a_parked_arm_are_disabled_after_the_last_tick_and_before_the_disconnect() -> None:

@@ -1,4 +1,4 @@
-"""Objects in the jaws: detection by angle and torque, and the rule that a motion keeps them unless it is asked to drop."""
+"""Objects in the jaws: detection by angle and torque, and the rule that no motion drops them unasked."""
 
 from __future__ import annotations
 

@@ -71,6 +71,7 @@ class Z1Arm:
         self._requests = StateRequester(self._client)
         self._modes = ModeMachine(self._client, self._requests, self._commands, self.config.connect_timeout_s)
         self._motions = ControllerMotions(self._client, self._requests, self._modes, self._lock)
+        self._found = Fsm.INVALID
 
     # --- Connection ---------------------------------------------------------------------------------------------
 
@@ -89,15 +90,16 @@ class Z1Arm:
             if self._keeper is not None:
                 take_over((self.config.local_host, self.config.state_port))
             client.open(self.config.connect_timeout_s)
-            found = client.newest.state
+            self._found = client.newest.state
             self._commands.grip_nm = None  # torque control of an earlier connection must not persist
             try:
                 self._start_keeper()
                 self._modes.start(self.config.mode)
             except HalError:
+                self._return_to_found_state()
                 self._close()
                 raise
-            log.info("Z1: connected to %s, which was in %s", client.link.describe(), found.name)
+            log.info("Z1: connected to %s, which was in %s", client.link.describe(), self._found.name)
 
     def disconnect(self) -> None:
         with self._lock:
@@ -129,6 +131,24 @@ class Z1Arm:
         if self._keeper is not None:
             self._keeper.stop(hold=self._client.newest.state is not Fsm.PASSIVE)
         self._client.close()
+
+    def give_back(self) -> None:
+        """Return the arm to the state in which `connect` found it, and only observe it from now on.
+
+        Without stiffness (PASSIVE) if it was so; from every other state it goes on holding where it is.
+        """
+        with self._lock:
+            self._modes.require_connection()
+            self._return_to_found_state()
+
+    def _return_to_found_state(self) -> None:
+        if self._found is not Fsm.PASSIVE or self._client.newest.state is Fsm.PASSIVE:
+            return
+        try:
+            self._requests.request(Fsm.PASSIVE)
+            self._modes.observe()
+        except HalError as error:
+            log.error("Z1: the arm was found without stiffness, and could not be returned to it: %s", error)
 
     # --- The contract -------------------------------------------------------------------------------------------
 

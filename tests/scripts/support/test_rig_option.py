@@ -10,12 +10,15 @@ from importlib.util import find_spec
 import pytest
 import tyro
 
+from hal.backends.mock_arm import MockArm
+from hal.backends.no_camera import NoCamera
 from hal.base.errors import CommandRejectedError, InvalidValueError, LeaseError
 from hal.bus.client import RemoteArm, RemoteCamera
 from hal.bus.session import BusConfig
 from hal.rig import RIGS
 from scripts.commands import run_demo, run_hal
 from scripts.support.rig_option import RigOption
+from sim_twin.backends import TwinCamera
 from sim_twin.drop_in.rig import free_ports
 from tests.support.errors import raises
 
@@ -42,6 +45,42 @@ def test_two_flags_are_an_error(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         tyro.cli(run_hal.Config, args=["--real", "--sim"])
     assert "not allowed together" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "parts"),
+    [
+        ([], None),
+        (["--arm", "z1", "--camera", "sim"], ("z1", "sim")),
+        (["--arm", "sim", "--camera", "d405"], ("sim", "d405")),
+        (["--real", "--camera", "sim"], ("z1", "sim")),
+        (["--real", "--no-camera"], ("z1", "none")),
+        (["--real", "--camera", "d405"], None),
+        (["--mock", "--camera", "sim"], ("mock", "sim")),
+        (["--wire-sim", "--no-camera"], None),
+    ],
+)
+def test_arm_and_camera_are_selected_one_by_one(arguments: list[str], parts: tuple[str, str] | None) -> None:
+    config = tyro.cli(run_hal.Config, args=[*arguments, "--arm.host", "192.0.2.1"])
+    assert config.rig.parts == parts
+    assert config.arm.host == "192.0.2.1"
+
+
+def test_a_mixed_rig_is_made_from_the_options_without_its_devices() -> None:
+    rig = run_hal.make_rig(tyro.cli(run_hal.Config, args=["--mock", "--camera", "sim", "--object", "box"]))
+    assert isinstance(rig.arm, MockArm) and isinstance(rig.camera, TwinCamera)
+    assert rig.camera.world.config.object == "box"
+    rig = run_hal.make_rig(tyro.cli(run_hal.Config, args=["--mock", "--no-camera"]))
+    assert isinstance(rig.camera, NoCamera)
+
+
+def test_parts_of_a_whole_rig_and_two_cameras_are_rejected() -> None:
+    with raises(InvalidValueError, "no_parts"):
+        _ = RigOption(wire_sim=True, camera="d405").parts
+    with raises(InvalidValueError, "two_cameras"):
+        RigOption(camera="d405", no_camera=True)
+    with raises(InvalidValueError, "no_ground_truth"):
+        run_demo.Config(rig=RigOption(no_camera=True))
 
 
 @pytest.mark.parametrize("rig", [RigOption(real=True), RigOption(mock=True)])

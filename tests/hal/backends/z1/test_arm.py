@@ -76,6 +76,27 @@ def low() -> Bench:
     return bench
 
 
+@pytest.mark.parametrize(
+    ("found", "returned"),
+    [(Fsm.PASSIVE, Fsm.PASSIVE), (Fsm.JOINTCTRL, Fsm.JOINTCTRL), (Fsm.CARTESIAN, Fsm.JOINTCTRL)],
+)
+@pytest.mark.parametrize("mode", [Z1Mode.TRACKING, Z1Mode.LOW_LEVEL])
+def test_an_arm_that_is_given_back_is_limp_only_if_it_was(mode: Z1Mode, found: Fsm, returned: Fsm) -> None:
+    bench = make_bench(mode, found)
+    bench.arm.connect()
+    assert bench.peer.fsm is not Fsm.PASSIVE
+    bench.arm.give_back()
+    bench.arm.disconnect()
+    assert bench.peer.fsm is returned
+
+
+def test_an_arm_that_was_only_observed_is_given_back_without_a_request() -> None:
+    bench = make_bench(Z1Mode.OBSERVE, Fsm.JOINTCTRL)
+    bench.arm.connect()
+    bench.arm.give_back()
+    assert bench.peer.fsm is Fsm.JOINTCTRL
+
+
 def make_turn(bench: Bench) -> TrajectoryCommand:
     """Return the move that turns joint1 by 2 rad."""
     q = bench.peer.q[:6] + 2.0 * np.eye(6)[0]

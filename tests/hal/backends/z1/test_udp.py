@@ -140,7 +140,7 @@ def test_the_real_rig_is_known_by_its_name() -> None:
     rig = RIGS.make("real", arm=Z1ArmConfig(connect_timeout_s=1.0), scene=None)
     assert isinstance(rig.arm, Z1Arm)
     assert rig.arm.config.connect_timeout_s == 1.0
-    assert rig.independent
+    assert rig.find_arm is not None and rig.give_back is not None
     assert rig.park is not None
     assert rig.park.disable_motors == rig.arm.go_passive
     assert Guard().find_violation(np.append(rig.park.q, 0.0)[None], np.append(z1.Q_HOME, 0.0)) is None
