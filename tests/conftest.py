@@ -9,7 +9,7 @@ import tempfile
 import pytest
 from hypothesis import settings
 
-pytest_plugins = ["tests.support.faults_table"]
+pytest_plugins = ["tests.support.faults_table", "tests.support.vendor.table"]
 
 # The same examples in every run, so that a failure is reproducible; to search for new ones:
 # HYPOTHESIS_PROFILE=explore ./z1 test
