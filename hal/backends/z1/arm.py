@@ -1,8 +1,8 @@
 """Driver of the real Z1: the vendor's controller over UDP, with the limits and checks that it lacks.
 
-That controller has no fast watchdog (it keeps its last command), no position limit while tracking and no torque limit
-in LOWCMD (measured on the vendor's controller). All three are enforced here, on every command, and at most one control
-period of motion is handed over at a time, so that the arm comes to rest when its client ends.
+That controller has no position limit while tracking, no torque limit in LOWCMD, and a watchdog of 2.2 s that ends in a
+limp arm (measured). Limits are enforced here on every command, a few milliseconds of motion are handed over at a time,
+so that the arm comes to rest when its client ends, and a keeper process talks to the controller while this one cannot.
 """
 
 from __future__ import annotations
@@ -78,6 +78,9 @@ class Z1Arm:
     def connect(self) -> None:
         """Connect to the controller and hold the arm where it is, in the configured mode.
 
+        An arm that a keeper holds is taken over with its grip. From here to `disconnect` and beyond, a keeper process
+        sends in place of a driver that is silent or has ended.
+
         Raises:
             HalTimeoutError: no answer.
             LeaseError: another program uses the port.
@@ -102,6 +105,7 @@ class Z1Arm:
             log.info("Z1: connected to %s, which was in %s", client.link.describe(), self._found.name)
 
     def disconnect(self) -> None:
+        """Close the link. The keeper holds the arm from now on, unless it is in PASSIVE."""
         with self._lock:
             if self._modes.mode is None:
                 return
@@ -184,7 +188,7 @@ class Z1Arm:
         """Command the seven motors directly, in LOW_LEVEL; return the commands within the limits on position, speed
         and torque (`hal.backends.z1.torque_limits.limit_commands`). Nothing is compensated.
 
-        A torque without stiffness persists when this process ends: the controller repeats its last command.
+        A torque without stiffness ends when this process is silent for 0.2 s: the keeper then holds the posture.
 
         Raises:
             CommandRejectedError: the arm is in another mode, or does not follow.
@@ -277,7 +281,9 @@ class Z1Arm:
         """Start a motion of the controller (one of `hal.z1_protocol.states.MOVES`); `send` is rejected until its end.
 
         Raises:
-            CommandRejectedError: the controller ignores it, or the arm is not in TRACKING.
+            CommandRejectedError: the controller refuses it, an arc is on a line, or the arm is not in TRACKING
+                (BACKTOSTART alone also leaves LOW_LEVEL).
+            HalTimeoutError: the controller has not read the request, which was taken back.
         """
         self._motions.begin(state, body)
 
@@ -300,7 +306,7 @@ class Z1Arm:
         self.end_move()
 
     def back_to_start(self) -> None:
-        """Move to `startFlat`, at the controller's own speed, and wait for it."""
+        """Move to `startFlat` and close the gripper, at the controller's own speed, and wait for it."""
         self.begin_move(Fsm.BACKTOSTART)
         self.end_move()
 

@@ -232,7 +232,7 @@ class ArmInterface:
     # --- Motions of the controller ----------------------------------------------------------------------------------
 
     def backToStart(self) -> bool:
-        """Move to `startFlat`."""
+        """Move to `startFlat` and close the gripper."""
         return self._move(Fsm.BACKTOSTART)
 
     def labelRun(self, label: str) -> bool:

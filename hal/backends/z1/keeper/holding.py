@@ -21,6 +21,7 @@ SILENCE_S = 0.2
 """Silence of the driver after which the keeper sends in its place [s]."""
 
 _MAX_DATAGRAMS = 1024
+_ANSWER_S = 0.02  # ten of the controller's cycles
 _GONE_S = 5.0  # a controller that restarts takes longer, and has let go of the arm by then
 _LIMP_COUNT = 3  # one answer alone may be older than the last request
 _STAYS = (Fsm.JOINTCTRL, Fsm.PASSIVE, Fsm.INVALID, Fsm.CALIBRATION)
@@ -61,7 +62,7 @@ class Keeper:
         self._active_s = self._answered_s = now_s
         self._sent_s = -np.inf
         self._limp = 0
-        self._reads = False
+        self._posture: JointCommands | None = None
 
     def end_owner(self, now_s: float) -> None:
         """Take over, since the driver has ended."""
@@ -89,17 +90,20 @@ class Keeper:
     def _stand_by(self, now_s: float) -> None:
         count = self._page.count()
         if count != self._count:
-            self._count, self._active_s, self._reads = count, now_s, False
+            self._count, self._active_s, self._posture = count, now_s, None
         elif now_s - self._active_s >= SILENCE_S and now_s - self._sent_s >= PERIOD_S:
-            if self._reads:  # from the second time on: what the driver has not read yet is none of ours
-                self._read(now_s)
-            self._reads = True
+            self._read(now_s)  # what the driver has not read by now is outdated for it
+            if self._posture is None and not _is_posture(command := self._last_command()) and command is not None:
+                # The arm may move under that torque: the posture must be that of an answer of this moment.
+                self._link.send(encode_command(Fsm.INVALID, command))
+                self._read(now_s, _ANSWER_S)
             self._send(now_s)
             self.stepped_in += 1
 
-    def _read(self, now_s: float) -> None:
+    def _read(self, now_s: float, timeout_s: float = 0.0) -> None:
         for _ in range(_MAX_DATAGRAMS):
-            data = self._link.receive()
+            data = self._link.receive(timeout_s)
+            timeout_s = 0.0
             if data is None:
                 return
             try:
@@ -118,10 +122,13 @@ class Keeper:
             requested = Fsm.PASSIVE
         elif self.phase is Phase.HOLDING and state is not None and state.state not in _STAYS:
             requested = Fsm.JOINTCTRL  # out of a motion, a teaching, or motor commands that are not renewed
-        if state is not None and (requested is not Fsm.INVALID or command is None):
-            known = command is not None
-            posture = compute_posture(state.joints, command.q if known else None, command.kp if known else None)
-            self._link.send(encode_command(requested, posture))
+        # A torque without stiffness is not repeated for a driver that cannot end it.
+        if state is not None and (requested is not Fsm.INVALID or not _is_posture(command)):
+            if self._posture is None or requested is not Fsm.INVALID:
+                # Once: a posture that followed the measurement would creep with every load.
+                q, kp = (command.q, command.kp) if command is not None else (None, None)
+                self._posture = compute_posture(state.joints, q, kp)
+            self._link.send(encode_command(requested, self._posture))
         elif command is not None:
             self._link.send(encode_command(Fsm.INVALID, replace(command, dq=np.zeros(z1.N_JOINTS))))
         else:
@@ -136,3 +143,7 @@ class Keeper:
 
     def _end(self, reason: str) -> None:
         self.phase, self.reason = Phase.ENDED, reason
+
+
+def _is_posture(command: JointCommands | None) -> bool:
+    return command is not None and bool((command.kp[: z1.N_ARM] > 0.0).all())

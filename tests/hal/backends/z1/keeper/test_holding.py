@@ -92,16 +92,18 @@ def test_a_driver_that_ends_in_motion_leaves_an_arm_that_is_held(bench: Bench) -
     assert bench.peer.fsm is Fsm.JOINTCTRL
 
 
-def test_a_torque_without_stiffness_ends_with_its_driver() -> None:
+@pytest.mark.parametrize("end", ["killed", "silent"])
+def test_a_torque_without_stiffness_ends_with_its_driver(end: str) -> None:
     bench = Bench(Z1Mode.LOW_LEVEL)
     push = JointCommands(tau=np.eye(z1.N_JOINTS)[0] * 5.0)
     for _ in range(20):
         bench.arm.read_state()
         bench.arm.send_motors(push)
         bench.clock.advance(z1.CONTROL_PERIOD_S)
-    bench.keeper.end_owner(bench.clock.now_s())
-    bench.idle(0.3)
-    assert bench.peer.fsm is Fsm.JOINTCTRL
+    if end == "killed":
+        bench.keeper.end_owner(bench.clock.now_s())
+    bench.idle(1.0)
+    assert bench.peer.fsm is (Fsm.JOINTCTRL if end == "killed" else Fsm.LOWCMD)
     assert bench.idle(WATCHDOG_S) < 0.01
 
 
