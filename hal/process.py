@@ -7,12 +7,12 @@ import logging
 import os
 import signal
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from threading import Event, Thread
 
 import numpy as np
 
-from hal.base.errors import HalError, InvalidValueError
+from hal.base.errors import CommandRejectedError, HalError, InvalidValueError
 from hal.base.messages import ServoMode
 from hal.base.z1 import CONTROL_PERIOD_S, N_ARM
 from hal.bus.server import HalServer
@@ -79,7 +79,7 @@ def serve(
         monitor_only: measure and publish only; the arm is neither commanded nor stopped nor parked.
 
     Raises:
-        HalError: a device does not answer, the port is taken, or the servo or the server failed while running.
+        HalError: a device does not answer, the port is taken, or the servo failed while running.
         InvalidValueError: the rig runs in lock-step (`lockstep_rig`).
     """
     if rig.call_every_tick is not None:
@@ -118,11 +118,10 @@ def serve(
             if poll % _COLLECT_EVERY == 0:
                 collect_garbage(servo)
             if server.failed.is_set():
-                raise HalError(
-                    "hal process: a thread of the link's server failed; the arm is being stopped. See the traceback "
-                    "above.",
-                    code="server_failed",
-                )
+                server.failed.clear()
+                # The process goes on, as an arm without a client may go limp.
+                with suppress(CommandRejectedError):  # monitor-only: another program moves the arm
+                    servo.stop("a thread of the HAL's link failed; see the traceback in its log, and restart the HAL")
 
 
 def _await_first_tick(servo: Servo, ticking: ServoThread) -> None:

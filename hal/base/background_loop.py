@@ -1,7 +1,7 @@
 """Supervised threads: a worker with start, stop and a `with` block, and restarts of work that fails.
 
-An error in a thread never passes unseen: it restarts the work, a few times, and then reaches `on_failure`, and whoever
-stops the thread.
+An error in a thread is always reported: it restarts the work, a few times, and then reaches `on_failure` and the
+caller that stops the thread.
 """
 
 from __future__ import annotations

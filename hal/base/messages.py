@@ -206,11 +206,12 @@ class ArmSetpoint:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class TrajectoryChunk:
-    """A section of a joint trajectory, sent about 0.2 s before it is due.
+    """A section of a joint trajectory, sent about 0.3 s before it is due.
 
     Trajectory time starts at 0 with the first point of the first chunk; the servo starts that clock when it accepts
-    the chunk and pauses it when a tick is late, so sender and servo need no common clock. A chunk of a new trajectory
-    replaces the rest of the old one.
+    the chunk and pauses it when a tick is late, so sender and servo need no common clock. A trajectory begins and ends
+    at rest. A chunk of a new trajectory replaces the rest of the old one: the arm stops on that, and goes to the new
+    start.
     """
 
     trajectory_id: int
@@ -222,7 +223,8 @@ class TrajectoryChunk:
     dq: np.ndarray
     """(N, 7) joint velocities [rad/s]."""
     final: bool = False
-    """True on the last chunk: the servo then holds its last point instead of reporting a buffer underrun."""
+    """True on the last chunk, which ends at rest: the servo then holds its last point. Without it, the servo brakes
+    before the buffer is empty."""
 
     def __post_init__(self) -> None:
         n = len(np.atleast_1d(self.t_s))

@@ -13,6 +13,7 @@ from typing import Any
 
 import zenoh
 
+from hal.base.background_loop import run_supervised
 from hal.base.clock import WallClock
 from hal.base.errors import HalError, InvalidMessageError
 from hal.bus.authentication import Request, sign_answer
@@ -47,7 +48,7 @@ def receive_items(handler: Any) -> Iterator[Any]:
 
 
 class ServiceThread(Thread):
-    """A daemon thread that calls `on_failure` when an unexpected error ends it; the traceback is printed as usual."""
+    """A daemon thread that starts its work again after an error, a few times; then `on_failure` is called."""
 
     def __init__(self, name: str, run: Callable[[], None], on_failure: Callable[[], None]) -> None:
         super().__init__(name=name, daemon=True)
@@ -55,13 +56,7 @@ class ServiceThread(Thread):
         self._on_death = on_failure
 
     def run(self) -> None:
-        ended = False
-        try:
-            self._work()
-            ended = True
-        finally:
-            if not ended:
-                self._on_death()
+        run_supervised(self.name, self._work, lambda _: self._on_death())
 
 
 class Listener:

@@ -217,7 +217,8 @@ class Guard:
         space = self.workspace
         self._allowed = np.array([0.0, space.table_m, space.self_m]) - _SLACK_M
         q = np.zeros((1, z1.N_JOINTS))
-        self.compute_margins(q), self.find_violation(q, q[0])  # compiled before anything moves
+        self.compute_margins(q)  # compiled before anything moves, as the next one
+        self.find_violation(q, q[0])
 
     def compute_margins(self, q: np.ndarray) -> Margins:
         """Return the margins of postures `q` (N, 7) [rad], in some microseconds each."""

@@ -111,10 +111,10 @@ def clip_setpoint(
     q: np.ndarray,
     dq: np.ndarray,
     *,
-    q_command: np.ndarray,
     q_last: np.ndarray,
     q_measured: np.ndarray,
     dq_measured: np.ndarray,
+    q_command: np.ndarray | None = None,
 ) -> ClippedSetpoint:
     """Return the setpoint nearest to `q` that the limits allow this tick.
 
@@ -126,24 +126,27 @@ def clip_setpoint(
         limits: the limits.
         q: (7,) desired positions [rad].
         dq: (7,) desired velocities [rad/s].
-        q_command: (7,) command of the tick before, which the arm itself may have limited further [rad]. A joint that
-            is outside its limits, as one that rests on its stop may be by the error of its encoder, stays there.
         q_last: (7,) setpoint of the tick before [rad].
         q_measured: (7,) newest measured positions [rad].
         dq_measured: (7,) newest measured velocities [rad/s].
+        q_command: (7,) command of the tick before, which the arm itself may have limited further [rad]. A joint that
+            is outside its limits there, as one that rests on its stop may be by the error of its encoder, may stay;
+            None = it has to return.
     """
+    q_min = limits.q_min if q_command is None else np.minimum(limits.q_min, q_command)
+    q_max = limits.q_max if q_command is None else np.maximum(limits.q_max, q_command)
     lead_rad = limits.grip_torque_nm / z1.KP[_GRIPPER]
     # A measured speed beyond the joint's own is an error of measurement and must not extend the lead.
     on_rad = min(max(dq_measured[_GRIPPER], -limits.dq_max[_GRIPPER]), limits.dq_max[_GRIPPER]) * limits.gripper_lag_s
     low, high = q_measured[_GRIPPER] - lead_rad + min(on_rad, 0.0), q_measured[_GRIPPER] + lead_rad + max(on_rad, 0.0)
     step = SPEED_TOLERANCE * limits.dq_max * z1.CONTROL_PERIOD_S
-    lowest = np.maximum(np.minimum(limits.q_min, q_command), q_last - step)
-    highest = np.minimum(np.maximum(limits.q_max, q_command), q_last + step)
+    lowest = np.maximum(q_min, q_last - step)
+    highest = np.minimum(q_max, q_last + step)
     velocity = np.minimum(np.maximum(dq, -limits.dq_max), limits.dq_max)
     # As at nearly every tick; `&` of two arrays and one `all` are half the time of what follows.
     if low <= q[_GRIPPER] <= high and ((q >= lowest) & (q <= highest)).all():
         return ClippedSetpoint(q.copy(), velocity, False)
-    allowed = np.minimum(np.maximum(q, np.minimum(limits.q_min, q_command)), np.maximum(limits.q_max, q_command))
+    allowed = np.minimum(np.maximum(q, q_min), q_max)
     # The motors' servos add damping times this speed: at a position limit it would push beyond it.
     velocity[allowed != q] = 0.0
     grip = min(max(allowed[_GRIPPER], low), high)

@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 
 from hal.base.z1 import CONTROL_PERIOD_S
 from hal.servo.limits import ServoLimits
 
-if TYPE_CHECKING:
-    from hal.servo.trajectory_buffer import TrajectoryBuffer
-
 _MIN_STOP_S = 10 * CONTROL_PERIOD_S  # a stop from almost no speed still gets a few ticks to slow down in
+
+
+class StoppablePath(Protocol):
+    """A buffered trajectory (`hal.servo.trajectory_buffer.TrajectoryBuffer`)."""
+
+    def at(self, t_s: float) -> tuple[np.ndarray, np.ndarray]: ...
+
+    def stop_duration(self, t_s: float) -> float: ...
 
 
 class PathStop:
     """A stop along the trajectory being played, at the rate 1 − 3u² + 2u³ of its time with u = t / `duration_s`."""
 
-    def __init__(self, path: TrajectoryBuffer, start_s: float) -> None:
+    def __init__(self, path: StoppablePath, start_s: float) -> None:
         self._path, self._start_s = path, start_s
         self.duration_s = path.stop_duration(start_s)
         """Duration until rest [s]; the trajectory's own time advances by half of that."""

@@ -94,8 +94,8 @@ class SetpointGenerator:
 
         Args:
             new: the trajectory, which starts at rest.
-            q_sent: (7,) last setpoint sent [rad]; a gripper that squeezes begins where it is, or where it was told to
-                close to, whichever is nearer.
+            q_sent: (7,) last setpoint sent [rad]; a gripper that squeezes begins where it is, or at the angle that it
+                was commanded to, whichever is nearer.
         """
         self.trajectory_id, self.trajectory_time_s = new.trajectory_id, -CONTROL_PERIOD_S  # `play` advances first: to 0
         self.mode, self.reason, self.finished = ServoMode.TRACKING, "", False

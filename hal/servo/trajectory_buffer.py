@@ -139,18 +139,15 @@ def extend_buffer(
     _check_size(chunk, old.t_s[keep])
     # The last point may be between two ticks: it is a knot of the new part, and no longer a point of the buffer.
     on_tick = len(old.t_s) - int(_tick_of(old.end_s) * CONTROL_PERIOD_S < old.end_s - _SAME_TIME_S)
-    knots = [np.append(old.end_s, chunk.t_s[skip:]), *(np.vstack([a[-1], b[skip:]]) for a, b in _pairs(old, chunk))]
-    t_s, q, dq = _resample(*knots, _tick_of(old.end_s) + 1, chunk.final)
+    t_s = np.append(old.end_s, chunk.t_s[skip:])
+    q, dq = np.vstack([old.q[-1], chunk.q[skip:]]), np.vstack([old.dq[-1], chunk.dq[skip:]])
+    t_s, q, dq = _resample(t_s, q, dq, _tick_of(old.end_s) + 1, chunk.final)
     t_s = np.concatenate([old.t_s[keep:on_tick], t_s])
     q, dq = np.concatenate([old.q[keep:on_tick], q]), np.concatenate([old.dq[keep:on_tick], dq])
     seam = max(on_tick - keep - 1 - _REST_ROWS, 0)
     _check_points(chunk, t_s[seam:], q[seam:], dq[seam:], limits)
     stop_s = path_stop_durations(dq, limits)
     return TrajectoryBuffer(chunk.trajectory_id, t_s.tolist(), q, dq, chunk.final, stop_s)
-
-
-def _pairs(old: TrajectoryBuffer, chunk: TrajectoryChunk) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
-    return (old.q, chunk.q), (old.dq, chunk.dq)
 
 
 def _tick_of(t_s: float) -> int:

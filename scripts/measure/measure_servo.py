@@ -220,17 +220,17 @@ def _run_servo(options: Options) -> tuple[np.ndarray, str]:
 
 
 def _swing(servo: Servo, ended: threading.Event) -> None:
-    """Stream a gentle swing of all joints in chunks of 0.1 s, about 0.2 s ahead, until `ended`."""
+    """Stream a gentle swing of all joints in chunks of 0.1 s, about 0.3 s ahead, until `ended`."""
     centre = servo.read_state().q
     start_s, sent_s = servo.clock.now_s(), 0.0
     while not ended.is_set():
         t_s = sent_s + np.linspace(0, 0.1, 6)
-        angle = 0.2 * (1 - np.cos(t_s))  # 1 − cos: from rest
-        q = centre + angle[:, None] * np.ones(N_JOINTS)
-        dq = (0.2 * np.sin(t_s))[:, None] * np.ones(N_JOINTS)
+        # sin³ has no acceleration where it begins: from rest without a jump
+        q = centre + (0.1 * np.sin(t_s) ** 3)[:, None] * np.ones(N_JOINTS)
+        dq = (0.3 * np.sin(t_s) ** 2 * np.cos(t_s))[:, None] * np.ones(N_JOINTS)
         servo.stream(TrajectoryChunk(trajectory_id=1, t_s=t_s, q=q, dq=dq))
         sent_s += 0.1
-        servo.clock.sleep_until(start_s + sent_s - 0.2)
+        servo.clock.sleep_until(start_s + sent_s - 0.3)
 
 
 if __name__ == "__main__":

@@ -24,6 +24,7 @@ from hal.bus.session import BusConfig, open_session
 from hal.parking import Parking
 from hal.process import serve
 from hal.rig import Rig
+from hal.servo.servo import Servo
 from tests.support.errors import raises
 
 pytestmark = pytest.mark.integration
@@ -91,18 +92,34 @@ def test_an_error_in_the_servo_ends_the_process_with_that_error_and_the_arm_stop
         arm.read_state()
 
 
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
-def test_an_error_in_a_thread_of_the_server_ends_the_process(monkeypatch: pytest.MonkeyPatch) -> None:
-    rig, config = make_rig(), free_config()
-    monkeypatch.setattr(rig.camera, "wait_for_frame", lambda _: 1 / 0)
+def test_a_thread_of_the_server_that_fails_for_good_stops_the_arm_and_the_process_goes_on(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    rig, config, ended = make_rig(), free_config(), Event()
+    failures: list[None] = []
+    reasons: list[str] = []
+    stop = Servo.stop
+
+    def fail(_: float) -> None:
+        failures.append(None)
+        raise ZeroDivisionError("a defect")
+
+    def stop_and_end(servo: Servo, reason: str = "") -> None:
+        reasons.append(reason)
+        stop(servo, reason)
+        ended.set()
+
+    monkeypatch.setattr(rig.camera, "wait_for_frame", fail)
+    monkeypatch.setattr(Servo, "stop", stop_and_end)
     with ExitStack() as undo:
 
         def listen() -> None:
             session = undo.enter_context(open_session(config, listen=False))
             undo.callback(Listener(session, keys.FRAME, lambda _: None).close)
 
-        with raises(HalError, "server_failed"):
-            serve(rig, config, Event(), on_ready=listen)
+        serve(rig, config, ended, on_ready=listen)
+    assert len(failures) == 4, "it is started again three times"
+    assert "a thread of the HAL's link failed" in reasons[0]
 
 
 class WatchedArm(MockArm):

@@ -52,8 +52,8 @@ Watcher = Callable[[ArmState, ServoStatus], None]
 class Executor:
     """Plays trajectories on a `ServoedArm` whose lease is held.
 
-    On the wall clock a thread of its own sends the chunks; in lock-step, where time stands still between two sleeps of
-    the caller, they are sent inline, and the same calls give the same bytes.
+    On the wall clock a thread of its own sends the chunks; in lock-step, where time moves only while the caller
+    sleeps, they are sent inline, and the same calls give the same bytes.
     """
 
     def __init__(self, arm: ServoedArm, clock: Clock, config: ExecutorConfig | None = None) -> None:

@@ -27,7 +27,7 @@ def test_a_few_random_sequences_of_legal_commands_have_no_violation() -> None:
 @pytest.mark.slow
 @pytest.mark.timeout(0)
 def test_many_random_sequences_of_legal_commands_have_no_violation() -> None:
-    """100,000 sequences, about 20 million setpoints, in about an hour of one core; Z1_SEQUENCES sets another number."""
+    """100,000 sequences, 36 million setpoints, in about an hour of one core; Z1_SEQUENCES sets another number."""
     total = Violations()
     for first in range(_FEW, _FEW + _MANY, 1000):
         found, seed = run_sequences(range(first, min(first + 1000, _FEW + _MANY)))

@@ -86,7 +86,8 @@ def test_an_error_in_one_tick_latches_the_stop_and_the_ticks_go_on(monkeypatch: 
     with ServoThread(servo, clock):
         while servo.status().trajectory_time_s < 0.2:
             clock.sleep_until(clock.now_s() + 0.005)
-        run, errors = servo._cycle.run, [ZeroDivisionError("a defect")]
+        run = servo._cycle.run
+        errors: list[Exception] = [ZeroDivisionError("a defect")]
         monkeypatch.setattr(servo._cycle, "run", lambda now_s: fail_once(errors) or run(now_s))
         while servo.status().mode is not ServoMode.STOPPED:
             clock.sleep_until(clock.now_s() + 0.005)

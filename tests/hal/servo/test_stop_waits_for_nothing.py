@@ -32,7 +32,7 @@ ATTACKS = {
     "the greatest number": lambda: still(2**53, [0.0, 0.1]),
     "a number of 400 digits": lambda: still(10**400, [0.0, 0.1]),
     "a position of 1e300 rad": lambda: TrajectoryChunk(
-        trajectory_id=2, t_s=[0.0, 0.1], q=np.full((2, N_JOINTS), 1e300), dq=np.zeros((2, N_JOINTS))
+        trajectory_id=2, t_s=np.array([0.0, 0.1]), q=np.full((2, N_JOINTS), 1e300), dq=np.zeros((2, N_JOINTS))
     ),
 }
 

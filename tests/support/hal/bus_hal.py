@@ -50,8 +50,8 @@ def slow_motion(trajectory_id: int = 1, duration_s: float = 3.0, start: np.ndarr
     s = np.linspace(0.0, 1.0, int(50 * duration_s) + 1)
     q = np.tile(start, (len(s), 1))
     dq = np.zeros((len(s), N_JOINTS))
-    q[:, 0] += 0.6 * (3 * s**2 - 2 * s**3)
-    dq[:, 0] = 0.6 * (6 * s - 6 * s**2) / duration_s
+    q[:, 0] += 0.6 * (10 * s**3 - 15 * s**4 + 6 * s**5)
+    dq[:, 0] = 0.6 * (30 * s**2 - 60 * s**3 + 30 * s**4) / duration_s
     return TrajectoryChunk(trajectory_id=trajectory_id, t_s=s * duration_s, q=q, dq=dq, final=True)
 
 

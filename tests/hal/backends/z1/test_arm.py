@@ -562,9 +562,10 @@ def play(bench: Bench, inject_fault: Callable[[], None]) -> Servo:
     q = servo.read_state().q
     t_s = np.linspace(0, 2, 101)
     path = np.tile(q, (101, 1))
-    path[:, 0] += 0.5 * (1 - np.cos(np.pi * t_s / 2))
+    u = t_s / 2
+    path[:, 0] += 10 * u**3 - 15 * u**4 + 6 * u**5
     speed = np.zeros_like(path)
-    speed[:, 0] = 0.25 * np.pi * np.sin(np.pi * t_s / 2)
+    speed[:, 0] = (30 * u**2 - 60 * u**3 + 30 * u**4) / 2
     servo.stream(TrajectoryChunk(trajectory_id=1, t_s=t_s, q=path, dq=speed, final=True))
     for i in range(1250):
         if i == 400:

@@ -65,9 +65,9 @@ def test_the_servo_executes_a_trajectory_over_udp(peer: FakeController, config: 
         q = servo.status().q_command
         t_s = np.linspace(0, 1, 51)
         path = np.tile(q, (51, 1))
-        path[:, 0] += 0.1 * (1 - np.cos(np.pi * t_s))
+        path[:, 0] += 0.2 * (10 * t_s**3 - 15 * t_s**4 + 6 * t_s**5)
         speed = np.zeros_like(path)
-        speed[:, 0] = 0.1 * np.pi * np.sin(np.pi * t_s)
+        speed[:, 0] = 0.2 * (30 * t_s**2 - 60 * t_s**3 + 30 * t_s**4)
         servo.stream(TrajectoryChunk(trajectory_id=1, t_s=t_s, q=path, dq=speed, final=True))
         await_true(lambda: servo.status().finished or servo.status().mode is ServoMode.STOPPED)
         assert servo.status().reason == ""
