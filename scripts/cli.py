@@ -33,7 +33,7 @@ COMMANDS = {
     ),
     "stop": ("scripts.commands.stop_arm", "stop the arm now; the stop latches until rearm"),
     "rearm": ("scripts.commands.rearm_arm", "lift the latched stop, after inspecting the arm"),
-    "keys": ("scripts.commands.manage_keys", "make the keys of a link beyond this machine: certificates with roles"),
+    "keys": ("scripts.keys.manage_keys", "make the keys of a link beyond this machine: certificates with roles"),
     "release-arm": ("scripts.arm.release_arm", "let go of an arm that is held after its HAL has ended"),
     "doctor": ("scripts.commands.doctor", "check this machine, and show the fix of each failed check"),
     "show-config": ("scripts.commands.show_config", "print every setting in force and its origin"),

@@ -16,6 +16,8 @@ ROLES = (OPERATOR, VIEWER)
 """An operator commands the arm; a viewer reads, and can stop it like everybody."""
 
 _MAX_HEARTBEATS_HZ = 250.0  # five times the owner's rate; drops a flood before it reaches Python
+# A service keeps 32 waiting messages, so these bound what a flood of large ones takes of the memory: 80 MB.
+_MAX_BYTES, _MAX_CHUNK_BYTES = 64 * 2**10, 2 * 2**20  # the longest chunk has 1.2 MB
 _IN, _OUT = "ingress", "egress"
 
 
@@ -81,3 +83,12 @@ def heartbeat_limit(robot: str) -> list[dict[str, Any]]:
     """Return Zenoh's `downsampling` settings: the rate of heartbeats from one client."""
     rules = [{"key_expr": f"{robot}/{keys.HEARTBEAT}", "freq": _MAX_HEARTBEATS_HZ}]
     return [{"flows": [_IN], "messages": ["put"], "rules": rules}]
+
+
+def size_limits(robot: str) -> list[dict[str, Any]]:
+    """Return Zenoh's `low_pass_filter` settings: sizes of what a client sends."""
+    small = [f"{robot}/{key}" for key in (*keys.SERVICES, keys.HEARTBEAT) if key != keys.CHUNK]
+    limits = ((small, _MAX_BYTES), ([f"{robot}/{keys.CHUNK}"], _MAX_CHUNK_BYTES))
+    return [
+        {"flows": [_IN], "messages": ["put", "query"], "key_exprs": names, "size_limit": size} for names, size in limits
+    ]

@@ -24,6 +24,7 @@ from hal.bus.service import Listener, as_bytes
 from hal.bus.session import BusConfig
 
 _LOG = logging.getLogger(__name__)
+_MAX_REASON_BYTES = 1000  # the HAL drops a message that is far too long, and a stop must arrive
 
 
 class RemoteArm:
@@ -128,7 +129,7 @@ class RemoteArm:
         Raises:
             HalTimeoutError: no answer: use the switch on the arm.
         """
-        self._command(keys.STOP, reason.encode())
+        self._command(keys.STOP, reason.encode()[:_MAX_REASON_BYTES])
 
     # --- Servo ----------------------------------------------------------------------------------------------------
 

@@ -7,9 +7,7 @@ nothing of size: `./z1 stop` must not wait for it.
 from __future__ import annotations
 
 import os
-import secrets
 import stat
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -27,7 +25,7 @@ def runtime_folders() -> tuple[Path, ...]:
     named = os.environ.get("XDG_RUNTIME_DIR")
     parents = [Path(named)] if named else []
     parents.append(Path(f"/run/user/{uid}"))
-    return (*(parent / "z1" for parent in dict.fromkeys(parents)), Path(tempfile.gettempdir()) / f"z1-{uid}")
+    return (*(parent / "z1" for parent in dict.fromkeys(parents)), Path(f"/tmp/z1-{uid}"))
 
 
 def make_runtime_folder() -> Path:
@@ -78,7 +76,7 @@ def make_secret(port: int) -> bytes:
     path.unlink(missing_ok=True)  # unreadable or too short: of a process that was killed while it wrote
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o600)
     with os.fdopen(descriptor, "wb") as file:
-        file.write(secret := secrets.token_bytes(SECRET_BYTES))
+        file.write(secret := os.urandom(SECRET_BYTES))
     return secret
 
 

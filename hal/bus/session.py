@@ -14,7 +14,7 @@ from typing import Any
 import zenoh
 
 from hal.base.errors import HalError, HalTimeoutError, InvalidValueError, MissingFileError
-from hal.bus.access_control import ROLES, access_control, heartbeat_limit
+from hal.bus.access_control import ROLES, access_control, heartbeat_limit, size_limits
 from hal.bus.codec import MAX_BYTES
 
 _LOG = logging.getLogger(__name__)
@@ -238,6 +238,7 @@ def zenoh_settings(config: BusConfig, *, listen: bool, shared_memory: bool) -> d
     if listen:
         settings["access_control"] = access_control(config.robot, clients, own_name)
         settings["downsampling"] = heartbeat_limit(config.robot)
+        settings["low_pass_filter"] = size_limits(config.robot)
     return settings
 
 

@@ -28,7 +28,7 @@ NOTHING_WAS_STOPPED = "NOTHING WAS STOPPED. USE THE SWITCH ON THE ARM."
 
 def main(arguments: Sequence[str]) -> int:
     """Stop the arm and print the servo's status; 1 when it is not known to be at rest."""
-    options = _parse(arguments)
+    options = parse(arguments)
     try:
         status = _stop_by_socket(options) or _stop_over_link(options)
     except Exception as error:  # every type: the first line is for the operator
@@ -47,7 +47,8 @@ def main(arguments: Sequence[str]) -> int:
     return 0
 
 
-def _parse(arguments: Sequence[str]) -> argparse.Namespace:
+def parse(arguments: Sequence[str]) -> argparse.Namespace:
+    """Return the options in `arguments`."""
     summary, _, rest = (__doc__ or "").partition("\n\n")
     parser = argparse.ArgumentParser(prog="z1 stop", description=summary, epilog=rest)
     parser.add_argument("--reason", default="./z1 stop", help="reason in the arm's status")

@@ -19,6 +19,7 @@ import tyro
 import yaml
 
 from scripts.cli import COMMANDS
+from scripts.commands.stop_arm import parse as parse_stop
 from z1_runtime.config import RuntimeConfig, config_from
 
 ROOT = Path(__file__).parents[2]
@@ -81,6 +82,9 @@ def check_command(line: str) -> None:
     assert name in COMMANDS, f"there is no command {name!r}"
     if name == "test":
         check_pytest_options(rest)
+        return
+    if name == "stop":  # which does without tyro, to be quick
+        parse_stop(rest)
         return
     module_name = COMMANDS[name][0]
     if name == "twin" and rest:

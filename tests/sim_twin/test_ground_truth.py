@@ -18,7 +18,7 @@ from hal.base.errors import HalTimeoutError
 from hal.bus.server import HalServer
 from hal.bus.session import BusConfig
 from hal.servo.servo import Servo
-from scripts.support.certificates import add_client, make_keys
+from scripts.keys.certificates import add_client, make_keys
 from sim_twin.ground_truth import GroundTruthClient, GroundTruthServer, read_ground_truth
 from sim_twin.model.world import World
 from tests.support.errors import raises

@@ -417,6 +417,22 @@ def test_an_unreadable_request_is_rejected_everywhere_but_at_the_stop(hal, intru
     assert "stop requested" in hal.servo.status().reason
 
 
+@pytest.mark.parametrize(("key", "size"), [(keys.CHUNK, 3 * 2**20), (keys.SEND, 100_000), (keys.CLAIM, 100_000)])
+def test_a_message_far_too_long_for_its_key_reaches_no_service(hal, intruder, key, size):
+    handled: list[str] = []
+    for service in hal.server._services:
+        service._handle = lambda request: handled.append(request.key) or b""
+    assert not [reply for reply in intruder.get(key, payload=bytes(size), timeout=0.3) if reply.ok]
+    (reply,) = list(intruder.get(keys.STOP, payload=b"a short one", timeout=5.0))
+    assert reply.ok is not None
+    assert handled == [keys.STOP]
+
+
+def test_a_stop_with_a_long_reason_arrives(hal, remote_arm):
+    remote_arm.stop("ü" * 100_000)
+    wait_until(lambda: hal.servo.status().mode is ServoMode.STOPPED)
+
+
 def test_malformed_requests_in_great_number_write_few_lines(hal, intruder, caplog):
     with caplog.at_level(logging.WARNING):
         for _ in range(40):

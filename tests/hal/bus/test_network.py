@@ -16,7 +16,7 @@ from hal.base.errors import HalError, InvalidValueError, MissingFileError, Z1Err
 from hal.bus import keys
 from hal.bus.session import BusConfig, open_session
 from hal.bus.stop_socket import StopClient
-from scripts.support.certificates import add_client, make_keys, revoke_client
+from scripts.keys.certificates import add_client, make_keys, revoke_client
 from tests.support.errors import raises
 from tests.support.hal.bus_hal import ROOT, end_processes, free_config
 from tests.support.hal.networks import make_networks

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from threading import Event
 
@@ -19,7 +20,7 @@ from hal.bus.codec import Hello, decode, encode
 from hal.bus.error_codec import decode_error
 from hal.bus.frames import FrameStamp
 from hal.bus.runtime_files import make_secret, read_secret
-from hal.bus.session import open_session
+from hal.bus.session import open_session, zenoh_settings
 from tests.support.errors import raises
 from tests.support.hal.bus_hal import HOME, free_config, moving, slow_motion, wait_until
 
@@ -161,7 +162,10 @@ def test_a_rogue_state_is_neither_forwarded_nor_taken(hal, remote_arm, stranger)
     assert abs(remote_arm.read_state().q[0] - nearly.q[0]) < 0.1
 
 
-def test_a_rogue_service_gets_no_request(hal, stranger):
+@pytest.mark.parametrize("mode", ["client", "peer", "router"])
+def test_a_rogue_service_gets_no_request(hal, mode):
+    settings = zenoh_settings(hal.config, listen=False, shared_memory=False) | {"mode": mode}
+    stranger = zenoh.open(zenoh.Config.from_json5(json.dumps(settings)))
     asked: list[str] = []
 
     def answer(query: zenoh.Query) -> None:
@@ -179,6 +183,7 @@ def test_a_rogue_service_gets_no_request(hal, stranger):
     assert [key for key in asked if key not in keys.PUBLISHED] == []
     for declared in (*rogues, listener):
         declared.undeclare()
+    stranger.close()
 
 
 @pytest.mark.parametrize("device", [RemoteArm, RemoteCamera])

@@ -12,7 +12,7 @@ import pytest
 
 from hal.base.errors import HalError, InvalidValueError, MissingFileError, OutputExistsError
 from scripts import cli
-from scripts.support.certificates import add_client, make_keys, revoke_client
+from scripts.keys.certificates import add_client, make_keys, revoke_client
 from tests.support.errors import raises
 
 pytestmark = [

@@ -13,7 +13,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from scripts.support.certificates import HAL, add_client, make_keys, revoke_client
+from scripts.keys.certificates import HAL, add_client, make_keys, revoke_client
 
 
 @dataclass(frozen=True, kw_only=True)
