@@ -85,7 +85,7 @@ class ServoLimits:
 def path_stop_peaks(limits: ServoLimits) -> tuple[np.ndarray, np.ndarray]:
     """Return bounds (7,) of acceleration [rad/s²] and jerk [rad/s³] of every stop on the path of a legal motion.
 
-    The stop slows the path's time down by 1 − 3u² + 2u³, u = t / `brake_s` (`hal.servo.path_stop`).
+    The stop slows the path's time down by 1 − 3u² + 2u³, u = t / `brake_s` (`hal.servo.braking`).
     """
     u = np.linspace(0.0, 1.0, 101)[:, None]
     rate, slope, bend = 1 - 3 * u**2 + 2 * u**3, 6 * u * (1 - u) / limits.brake_s, (6 - 12 * u) / limits.brake_s**2

@@ -14,8 +14,8 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
-from hal.base.arm import Arm, CommandLatency, TimedArm
 from hal.base.clock import Clock
 from hal.base.errors import CommandRejectedError, HalError, HalTimeoutError, NotConnectedError
 from hal.base.messages import ArmSetpoint, ArmState, ServoHealth, ServoMode, ServoStatus, TrajectoryChunk
@@ -24,6 +24,9 @@ from hal.servo.control_loop import ControlCycle
 from hal.servo.guard import Guard
 from hal.servo.limits import ServoLimits, clip_setpoint
 from hal.servo.status import PeriodStatistics, StatusLogger, make_health, make_status
+
+if TYPE_CHECKING:
+    from hal.base.arm import Arm
 
 log = logging.getLogger(__name__)
 
@@ -240,6 +243,8 @@ class Servo:
 
     def health(self) -> ServoHealth:
         """Return the health: timing, latency of the commands, faults and command authority."""
+        from hal.base.arm import CommandLatency, TimedArm
+
         latency = self.arm.command_latency() if isinstance(self.arm, TimedArm) else CommandLatency()
         return make_health(
             self._connected(),

@@ -15,9 +15,8 @@ import numpy as np
 
 from hal.base.messages import ServoMode
 from hal.base.z1 import CONTROL_PERIOD_S, N_ARM, N_JOINTS
-from hal.servo.braking import JointMove, JointStop, MotionState, TargetTracker
+from hal.servo.braking import JointMove, JointStop, MotionState, PathStop, TargetTracker
 from hal.servo.limits import ServoLimits
-from hal.servo.path_stop import PathStop
 from hal.servo.trajectory_buffer import TrajectoryBuffer
 
 _YIELD_THRESHOLD_RAD = 0.01  # below it the difference to the measurement is the servo's ordinary tracking error

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import logging
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from hal.base.arm import CommandLatency
 from hal.base.messages import ServoHealth, ServoStatus
 from hal.base.z1 import CONTROL_PERIOD_S
 from hal.servo.command_mailbox import CommandMailbox, Snapshot
+
+if TYPE_CHECKING:
+    from hal.base.arm import CommandLatency
 
 _SUMMARY_TICKS = 500  # one second at 500 Hz, the rate at which health is published
 _OVERRUN_PERIODS = 1.5  # a tick later than half a period has moved all later deadlines (`servo_thread`)

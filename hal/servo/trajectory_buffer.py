@@ -15,8 +15,8 @@ import numpy as np
 from hal.base.errors import CommandRejectedError
 from hal.base.messages import TrajectoryChunk
 from hal.base.z1 import CONTROL_PERIOD_S, JOINT_NAMES, N_JOINTS
+from hal.servo.braking import path_stop_durations
 from hal.servo.limits import SMOOTHNESS_TOLERANCE, SPEED_TOLERANCE, ServoLimits
-from hal.servo.path_stop import path_stop_durations
 
 MAX_GAP_S = 0.05
 """Maximum time between the end of one chunk and the start of the next [s]."""

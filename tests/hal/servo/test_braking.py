@@ -8,9 +8,8 @@ from ruckig import ControlInterface, InputParameter, Ruckig, Synchronization, Tr
 
 from hal.base.messages import TrajectoryChunk
 from hal.base.z1 import CONTROL_PERIOD_S, DDQ_MAX, DQ_MAX, N_JOINTS, Q_MAX, Q_MIN
-from hal.servo.braking import JointMove, JointStop, MotionState, TargetTracker
+from hal.servo.braking import JointMove, JointStop, MotionState, PathStop, TargetTracker, path_stop_durations
 from hal.servo.limits import ServoLimits
-from hal.servo.path_stop import PathStop, path_stop_durations
 from hal.servo.trajectory_buffer import TrajectoryBuffer
 from tests.support.hal.servo_bench import START, Bench
 

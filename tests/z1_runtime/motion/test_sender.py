@@ -16,9 +16,8 @@ from hal.servo.servo import Servo
 from hal.servo.servo_thread import ServoThread
 from tests.support.errors import raises
 from tests.support.lockstep import Bench
-from z1_runtime.motion.executor import Executor, ExecutorConfig
+from z1_runtime.motion.executor import AdaptiveLead, ChunkSender, Executor, ExecutorConfig, SenderConfig
 from z1_runtime.motion.limits import MotionLimits
-from z1_runtime.motion.sender import AdaptiveLead, ChunkSender, SenderConfig
 from z1_runtime.motion.trajectory import joint_move
 
 Q_START = np.append(z1.Q_HOME, -1.0)
