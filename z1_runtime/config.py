@@ -177,7 +177,9 @@ def hand_set(config: RuntimeConfig) -> Ranking:
 
 def save_config(config: RuntimeConfig, path: Path) -> None:
     """Write `config` as YAML that `load_config` reads back to an equal one."""
-    path.write_text(yaml.safe_dump(asdict(config), sort_keys=False))
+    from hal.base.files import atomic_write
+
+    atomic_write(path, yaml.safe_dump(asdict(config), sort_keys=False))
 
 
 def _require(ok: bool, name: str, seen: object, allowed: str) -> None:
