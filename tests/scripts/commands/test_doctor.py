@@ -141,7 +141,7 @@ def test_doctor_uses_the_root_of_this_checkout() -> None:
 @pytest.mark.parametrize(
     ("hard_limit", "state"), [(resource.RLIM_INFINITY, State.OK), (512 << 20, State.WARN), (64 << 20, State.WARN)]
 )
-def test_locked_memory_is_judged_as_the_servo_uses_it(
+def test_locked_memory_is_granted_where_the_servo_uses_it(
     monkeypatch: pytest.MonkeyPatch, hard_limit: int, state: State
 ) -> None:
     monkeypatch.setattr(resource, "getrlimit", lambda _: (hard_limit, hard_limit))
