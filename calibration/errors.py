@@ -4,13 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from hal.base.errors import Z1Error
+from hal.base.errors import UsageError, Z1Error
 
 
 class CalibrationError(Z1Error, ValueError):
     """A calibration that cannot be done, read or used."""
 
     default_code = "calibration"
+
+
+class CalibrationFileError(CalibrationError, UsageError):
+    """A calibration result or a folder of samples that cannot be used."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -16,6 +16,8 @@ from calibration.hand_eye.uncertainty import COVERAGE
 from calibration.intrinsics import IntrinsicsResult
 from calibration.pose_checks import pose_distances_mm_deg
 from calibration.results import CalibrationResult
+from hal.base.files import atomic_write
+from hal.base.output_folder import check_output_file
 from hal.base.transforms import inverse, rotation_vectors
 
 
@@ -49,8 +51,7 @@ def write_report(
     html = environment.get_template("report.html.j2").render(
         origin=_origin(calibration), warnings=calibration.quality_warnings(), **content
     )
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(html + "\n", encoding="utf-8")
+    atomic_write(check_output_file(path), html + "\n")
 
 
 def _origin(calibration: CalibrationResult) -> dict[str, str]:

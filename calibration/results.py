@@ -16,12 +16,13 @@ import numpy as np
 
 from calibration.board.board import Board
 from calibration.camera_model import CameraModel
-from calibration.errors import CalibrationError, CalibrationWarning
+from calibration.errors import CalibrationError, CalibrationFileError, CalibrationWarning
 from calibration.files import write_new
 from calibration.hand_eye.result import HandEyeResult, Setup
 from calibration.intrinsics import IntrinsicsResult
 from calibration.pose_checks import check_poses
 from hal.base.errors import InvalidValueError
+from hal.base.files import read_text
 
 logger = logging.getLogger(__name__)
 
@@ -216,7 +217,7 @@ def load_result(path: Path, *, serial: str | None = None) -> CalibrationResult:
     """
     found = _read(path)
     if serial is not None and found.serial != serial:
-        raise CalibrationError(
+        raise CalibrationFileError(
             f"{path}: result of camera {found.serial}, the connected camera is {serial}. Calibrate it, or give "
             "its own file.",
             code="wrong_serial",
@@ -229,7 +230,7 @@ def load_result(path: Path, *, serial: str | None = None) -> CalibrationResult:
 
 def _read(path: Path) -> CalibrationResult:
     try:
-        values = json.loads(path.read_text())
+        values = json.loads(read_text(path))
         if values["format"] != FORMAT:
             raise InvalidValueError(f"unknown format ({values['format']!r}, known: {FORMAT})")
         arrays = {
@@ -253,11 +254,11 @@ def _read(path: Path) -> CalibrationResult:
             **arrays,
         )
     except FileNotFoundError as error:
-        raise CalibrationError(
+        raise CalibrationFileError(
             f"there is no calibration result {path}. Run `./z1 calibrate`, or give another file.", code="missing_result"
         ) from error
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise CalibrationError(
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
+        raise CalibrationFileError(
             f"{path}: this is no calibration result ({error!r}). Calibrate again, or give another file.",
             code="damaged_result",
         ) from error
@@ -277,7 +278,7 @@ def load_newest(folder: Path, kind: Kind, serial: str) -> CalibrationResult:
         except CalibrationError as error:
             logger.warning("calibration skipped: %s", error)
     others = ", ".join(p.name for p in files if p.suffix == ".json") or "nothing"
-    raise CalibrationError(
+    raise CalibrationFileError(
         f"{folder}: no valid {kind} calibration of camera {serial} (found: {others}). Run `./z1 calibrate`.",
         code="missing_result",
     )

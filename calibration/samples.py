@@ -18,11 +18,12 @@ from PIL import Image
 
 from calibration.board.board import Board
 from calibration.camera_model import CameraModel
-from calibration.errors import CalibrationError, CalibrationWarning
+from calibration.errors import CalibrationError, CalibrationFileError, CalibrationWarning
 from calibration.files import write_new
 from calibration.hand_eye.result import Setup
 from calibration.pose_checks import check_poses
 from hal.base.errors import InvalidValueError
+from hal.base.files import read_text
 
 FORMAT = 1
 """Version of the file format; another one is rejected."""
@@ -95,7 +96,7 @@ def open_sample_folder(folder: Path, info: CaptureInfo) -> None:
     existing = load_capture_info(folder)
     wanted = (info.board, info.serial, info.setup, info.camera.to_dict())
     if (existing.board, existing.serial, existing.setup, existing.camera.to_dict()) != wanted:
-        raise CalibrationError(
+        raise CalibrationFileError(
             f"samples: {folder} holds others (camera {existing.serial}, {existing.setup}, {existing.board}, started "
             f"{existing.date}). Give another folder.",
             code="other_session",
@@ -110,7 +111,7 @@ def load_capture_info(folder: Path) -> CaptureInfo:
     """
     path = folder / "session.json"
     try:
-        values = json.loads(path.read_text())
+        values = json.loads(read_text(path))
         if values["format"] != FORMAT:
             raise InvalidValueError(f"unknown format ({values['format']!r}, known: {FORMAT})")
         return CaptureInfo(
@@ -122,12 +123,12 @@ def load_capture_info(folder: Path) -> CaptureInfo:
             ground_truth=values["truth"],
         )
     except FileNotFoundError as error:
-        raise CalibrationError(
+        raise CalibrationFileError(
             f"samples: {folder} has no session.json. Capture samples there with `./z1 calibrate capture`.",
             code="no_session",
         ) from error
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise CalibrationError(
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
+        raise CalibrationFileError(
             f"samples: {path} cannot be read ({error!r}). Capture again into another folder.", code="no_session"
         ) from error
 

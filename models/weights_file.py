@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import hashlib
 import threading
-import zipfile
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 
-from hal.base.errors import InvalidValueError, Z1Error
+from hal.base.errors import InvalidValueError, UsageError
 
 WEIGHTS_FOLDER = Path(__file__).resolve().parent / "weights"
 
 
-class WeightsError(Z1Error, ValueError):
+class WeightsError(UsageError):
     """Weights file that is missing, damaged or of another network."""
 
     default_code = "weights"
@@ -32,13 +31,13 @@ def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> str:
     """
     if path.suffix != ".npz":
         raise InvalidValueError(f"{path} must end in .npz: weights are kept as NumPy arrays.", code="weights_suffix")
-    from hal.base.files import atomic_path  # needs yaml, which an environment of a generator's own lacks
+    from hal.base.files import atomic_path, atomic_write  # needs yaml, which an environment of a generator's own lacks
 
     with atomic_path(path) as partial:
         with partial.open("wb") as file:
             np.savez(file, allow_pickle=False, **arrays)
         digest = sha256_of(partial)
-    path.with_suffix(".sha256").write_text(f"{digest}  {path.name}\n")
+    atomic_write(path.with_suffix(".sha256"), f"{digest}  {path.name}\n")
     return digest
 
 
@@ -48,11 +47,12 @@ def read_arrays(path: Path, make_command: str) -> dict[str, np.ndarray]:
     Raises:
         WeightsError: the file or its checksum is missing, they differ, or the file holds no plain arrays.
     """
+    from hal.base.files import read_npz
+
     verify_sha256(path, make_command)
     try:
-        with np.load(path, allow_pickle=False) as file:
-            return {key: file[key] for key in file.files}
-    except (ValueError, OSError, AttributeError, zipfile.BadZipFile) as err:
+        return read_npz(path)
+    except (ValueError, OSError) as err:
         raise WeightsError(
             f"{path.name} holds no plain NumPy arrays ({err}); make it again with `{make_command}`.",
             code="weights_not_arrays",
@@ -71,7 +71,8 @@ def verify_sha256(path: Path, make_command: str) -> str:
             raise WeightsError(
                 f"{needed} is missing; restore it, or make it with `{make_command}`.", code="weights_missing"
             )
-    actual, expected = sha256_of(path), next(iter(checksum.read_text().split()), "nothing")
+    # Whatever its encoding: a damaged checksum is one that differs
+    actual, expected = sha256_of(path), next(iter(checksum.read_text(errors="replace").split()), "nothing")
     if actual != expected:
         raise WeightsError(
             f"{path.name} has SHA-256 {actual[:12]}…, {checksum.name} says {expected[:12]}…: the file is damaged or "

@@ -164,9 +164,9 @@ def hand_set(config: RuntimeConfig) -> Ranking:
 
 def save_config(config: RuntimeConfig, path: Path) -> None:
     """Write `config` as YAML that `load_config` reads back to an equal one."""
-    from hal.base.files import plain
+    from hal.base.files import atomic_write, plain
 
-    path.write_text(yaml.safe_dump(plain(asdict(config)), sort_keys=False))
+    atomic_write(path, yaml.safe_dump(plain(asdict(config)), sort_keys=False))
 
 
 def _require(ok: bool, name: str, seen: object, allowed: str) -> None:

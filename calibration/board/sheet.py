@@ -9,6 +9,8 @@ from PIL import Image, ImageDraw, ImageFont
 
 from calibration.board.board import Board, paint_rectangles
 from calibration.errors import CalibrationError
+from hal.base.files import atomic_path
+from hal.base.output_folder import check_output_file
 
 PAPERS_MM = {"A4": (210.0, 297.0), "A3": (297.0, 420.0), "Letter": (215.9, 279.4)}
 """Width and height, upright."""
@@ -32,10 +34,11 @@ def save_sheet(board: Board, path: Path, *, paper: str = "A4") -> None:
     if path.suffix.lower() not in (".pdf", ".png"):
         raise CalibrationError(f"sheet: unknown format ({path.name!r}, allowed .pdf, .png).", code="bad_sheet")
     page = _render_page(board, page_mm)
-    if path.suffix.lower() == ".pdf":
-        page.save(path, resolution=DPI)
-    else:
-        page.save(path, dpi=(DPI, DPI))
+    with atomic_path(check_output_file(path)) as partial, partial.open("wb") as file:
+        if path.suffix.lower() == ".pdf":
+            page.save(file, format="PDF", resolution=DPI)
+        else:
+            page.save(file, format="PNG", dpi=(DPI, DPI))
 
 
 def _page_mm(board: Board, paper: str) -> tuple[float, float]:

@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from hal.base.clock import Clock, WallClock
-from hal.base.errors import CameraError, HalTimeoutError, NotConnectedError
+from hal.base.errors import CameraError, HalTimeoutError, NotConnectedError, UsageError
+from hal.base.files import atomic_path, read_npz
 from hal.base.messages import Intrinsics, RgbdFrame
 
 _PERIOD_S = 1 / 30  # of the D405's default rate
@@ -100,6 +101,10 @@ class ReplayCamera:
         return int(loops) * len(self._frames) + index
 
 
+class RecordingError(CameraError, UsageError):
+    """A file that holds no recorded frames."""
+
+
 def save_frames(path: str | Path, frames: Sequence[RgbdFrame]) -> None:
     """Write frames of one camera into a compressed `.npz`.
 
@@ -122,7 +127,7 @@ def save_frames(path: str | Path, frames: Sequence[RgbdFrame]) -> None:
     if all(mask is not None for mask in masks):
         arrays["ground_truth_mask"] = np.stack([np.asarray(mask) for mask in masks])
     arrays |= {f"intrinsics_{name}": np.array(value) for name, value in asdict(frames[0].intrinsics).items()}
-    with Path(path).open("wb") as file:
+    with atomic_path(Path(path)) as partial, partial.open("wb") as file:
         np.savez_compressed(file, allow_pickle=False, **arrays)
 
 
@@ -135,11 +140,10 @@ def load_frames(path: str | Path) -> list[RgbdFrame]:
 
     Raises:
         FileNotFoundError: no such file.
-        CameraError: the file holds no frames.
+        RecordingError: the file holds no frames.
     """
     try:
-        with np.load(Path(path), allow_pickle=False) as data:  # pickled objects could run code
-            arrays = {name: data[name] for name in data.files}
+        arrays = read_npz(Path(path))
         intrinsics = Intrinsics(
             width=int(arrays["intrinsics_width"]),
             height=int(arrays["intrinsics_height"]),
@@ -159,8 +163,8 @@ def load_frames(path: str | Path) -> list[RgbdFrame]:
             )
             for i, colour in enumerate(arrays["colour"])
         ]
-    except (KeyError, ValueError, AttributeError) as error:
-        raise CameraError(
+    except (KeyError, ValueError, AttributeError, TypeError, IndexError, OverflowError) as error:
+        raise RecordingError(
             f"replay camera: {path} holds no recorded frames ({error}); write it with save_frames().",
             code="not_a_recording",
         ) from error

@@ -117,12 +117,15 @@ def collect_garbage(servo: Servo) -> None:
         gc.collect()
 
 
+def may_lock_memory() -> bool:
+    """Return whether the servo locks its memory: only without a limit, which a later allocation could exceed."""
+    return resource.getrlimit(resource.RLIMIT_MEMLOCK)[1] == resource.RLIM_INFINITY
+
+
 def _lock_memory() -> bool:
-    # With a finite limit a later allocation would fail instead of being merely slow.
-    _, hard_limit = resource.getrlimit(resource.RLIMIT_MEMLOCK)
-    if hard_limit != resource.RLIM_INFINITY:
+    if not may_lock_memory():
         return False
-    resource.setrlimit(resource.RLIMIT_MEMLOCK, (hard_limit, hard_limit))
+    resource.setrlimit(resource.RLIMIT_MEMLOCK, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
     libc = ctypes.CDLL(None, use_errno=True)
     # ONFAULT locks each page when it is first used, instead of the whole address space at once.
     return libc.mlockall(_MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT) == 0

@@ -223,9 +223,13 @@ def _openvino_metadata(model: Any, path: Path) -> dict[str, str]:
     """Return the metadata of an export: in the .onnx, or in ultralytics' metadata.yaml next to the .xml."""
     metadata = path.with_name("metadata.yaml")
     if path.suffix == ".xml" and metadata.is_file():
-        import yaml
+        from hal.base.errors import ConfigError
+        from hal.base.files import read_yaml
 
-        data = yaml.safe_load(metadata.read_text())
+        try:
+            data = read_yaml(metadata, "the detector's")
+        except ConfigError as err:
+            raise WeightsError(f"{path.name}: {err}", code="no_class_names") from err
         return {key: str(value) for key, value in data.items()} if isinstance(data, dict) else {}
     try:
         return {"names": model.get_rt_info(["framework", "names"]).astype(str)}

@@ -31,7 +31,6 @@ class Config:
 
 def main(config: Config) -> int:
     """Write the page."""
-    config.out.parent.mkdir(parents=True, exist_ok=True)
     save_sheet(config.board, config.out, paper=config.paper)
     Console(highlight=False).print(
         f"{config.out}: print it at 100 %, check its ruler, and glue it to a flat plate. If the ruler is wrong, "

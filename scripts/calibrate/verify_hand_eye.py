@@ -22,6 +22,8 @@ from rich.console import Console
 from rich.table import Table
 
 from calibration.board.board import Board
+from hal.base.files import atomic_write
+from hal.base.output_folder import check_output_file
 from hal.base.transforms import inverse, transform_points
 from scripts.calibrate.calibration_samples import now
 from scripts.support.calibration_robot import CalibrationRobot, RobotOptions, open_robot
@@ -135,8 +137,7 @@ def _report(rows: list[dict[str, Any]], origin: str, config: Config, console: Co
         "tolerance_mm": 1e3 * config.tolerance_m,
         "corners": rows,
     }
-    config.out.parent.mkdir(parents=True, exist_ok=True)
-    config.out.write_text(json.dumps(summary, indent=2) + "\n")
+    atomic_write(check_output_file(config.out), json.dumps(summary, indent=2) + "\n")
     verdict = "[bold green]passed[/]" if passed else "[bold red]not passed[/]: calibrate again"
     console.print(
         f"{verdict}; mean offset {distances_mm.mean():.2f} mm, maximum {distances_mm.max():.2f} mm (allowed "

@@ -23,6 +23,7 @@ from rich.console import Console
 from rich.table import Table
 
 from hal.base.errors import InvalidValueError
+from hal.base.output_folder import open_output
 from scripts.support.progress import make_progress
 
 if TYPE_CHECKING:
@@ -104,6 +105,11 @@ class Config:
 
 def main(config: Config) -> int:
     """Run the missing episodes, write the results, and return 1 if any episode ended in an exception, else 0."""
+    with open_output(config.out):
+        return _run_all(config)
+
+
+def _run_all(config: Config) -> int:
     from hal.base.files import plain
     from sim_twin.benchmark.episodes.methods import parse_method
     from sim_twin.benchmark.episodes.runner import make_tasks

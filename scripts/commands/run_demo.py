@@ -21,7 +21,9 @@ from rich.console import Console
 
 from hal.base.clock import Stopwatch
 from hal.base.errors import HalError, InvalidValueError
+from hal.base.files import atomic_write
 from hal.base.messages import ServoStatus
+from hal.base.output_folder import open_output
 from hal.bus.session import BusConfig
 from scripts.commands.run_hal import TWINS
 from scripts.support.hal_process import HalProcess
@@ -80,8 +82,11 @@ class Config(PickOptions):
 def main(config: Config) -> int:
     """Run one pick; return 0 only if the object was lifted."""
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
-    console = Console(highlight=False)
-    config.out.mkdir(parents=True, exist_ok=True)
+    with open_output(config.out):
+        return _run(config, Console(highlight=False))
+
+
+def _run(config: Config, console: Console) -> int:
     for name in ("summary.json", "episode.rrd", "grasp.png"):  # a failed run leaves no old success in place
         (config.out / name).unlink(missing_ok=True)
     scene = config.scene
@@ -104,10 +109,10 @@ def main(config: Config) -> int:
         raise
     finally:
         if "success" in summary:
-            (config.out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
+            atomic_write(config.out / "summary.json", json.dumps(summary, indent=2) + "\n")
     from sim_twin.camera.external_view import draw_picture
 
-    (config.out / "grasp.png").write_bytes(draw_picture(scene.to_scene(), truth.qpos))
+    atomic_write(config.out / "grasp.png", draw_picture(scene.to_scene(), truth.qpos))
     _print_result(console, config, summary)
     return 0 if summary["success"] else 1
 

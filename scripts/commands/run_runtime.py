@@ -8,6 +8,7 @@
 from __future__ import annotations
 
 import logging
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -18,6 +19,7 @@ from rich.console import Console
 
 from hal.base.errors import StoppedError
 from hal.base.messages import ServoMode
+from hal.base.output_folder import open_output
 from hal.bus.client import RemoteArm
 from hal.bus.session import BusConfig
 from scripts.support.pick_options import PickOptions, print_phase
@@ -45,6 +47,13 @@ def main(config: Config) -> int:
     """
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
     console = Console(highlight=False)
+    with open_output(config.out) if config.out else nullcontext():
+        if config.out:
+            (config.out / "episode.rrd").unlink(missing_ok=True)  # a link there would be followed
+        return _run(config, console)
+
+
+def _run(config: Config, console: Console) -> int:
     check_authority(config.bus)
     from z1_runtime.robot import Robot
 

@@ -22,6 +22,8 @@ from rich.console import Console
 from rich.table import Table
 
 from hal.base.errors import InvalidValueError
+from hal.base.files import atomic_write
+from hal.base.output_folder import open_output
 from scripts.support.progress import make_progress
 
 if TYPE_CHECKING:
@@ -71,6 +73,11 @@ class Config:
 
 def main(config: Config) -> int:
     """Fit, evaluate, and write the scoring, the report and the evidence."""
+    with open_output(config.out):
+        return _run(config)
+
+
+def _run(config: Config) -> int:
     from sim_twin.benchmark.tuning.fit import tune
     from sim_twin.benchmark.tuning.folds import require_sklearn
     from sim_twin.benchmark.tuning.logged_episodes import load_logs
@@ -88,11 +95,10 @@ def main(config: Config) -> int:
         run=_make_runner(config, logs.config, console) if config.run else None,
         head=config.head,
     )
-    config.out.mkdir(parents=True, exist_ok=True)
     save_scoring(tuning.scoring, config.out / "scoring.yaml")
     write_tuning_report(tuning, config.out / "report.html")
     evidence = json.dumps(dict(tuning.scoring.evidence), indent=1, ensure_ascii=False)
-    (config.out / "tuning.json").write_text(evidence + "\n", encoding="utf-8")
+    atomic_write(config.out / "tuning.json", evidence + "\n")
     _print_tuning(console, tuning)
     console.print(f"scoring: {config.out}/scoring.yaml, report: {config.out}/report.html")
     return 0

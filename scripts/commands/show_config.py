@@ -9,7 +9,7 @@ from typing import Any
 
 import yaml
 
-from hal.base.files import plain
+from hal.base.files import plain, read_yaml
 from z1_runtime.config import load_config
 
 
@@ -31,7 +31,7 @@ def main(config: ShowConfig) -> int:
         ConfigError: the file cannot be used.
     """
     resolved = asdict(load_config(config.config))
-    given = yaml.safe_load(config.config.read_text()) or {} if config.config else {}
+    given = read_yaml(config.config, "the configuration") or {} if config.config else {}
     print("\n".join(to_lines(resolved, given, str(config.config))))
     return 0
 

@@ -230,11 +230,14 @@ def check_real_time() -> Check:
 def check_locked_memory() -> Check:
     import resource
 
+    from hal.servo.servo_thread import may_lock_memory
+
+    if may_lock_memory():
+        return Check("locked memory", State.OK, "unlimited")
     _, highest = resource.getrlimit(resource.RLIMIT_MEMLOCK)
-    if highest == resource.RLIM_INFINITY or highest >= 512e6 or os.geteuid() == 0:
-        return Check("locked memory", State.OK, "root" if os.geteuid() == 0 else "enough")
-    found = f"{highest / 1e6:.0f} MB: the servo loop may wait for the disk"
-    return Check("locked memory", State.WARN, found, _limits_fix("memlock unlimited"))
+    found = f"up to {highest / 1e6:.0f} MB, and the servo needs unlimited: it may wait for the disk"
+    fix = f"{_limits_fix('memlock unlimited')} (in a container: --ulimit memlock=-1)"
+    return Check("locked memory", State.WARN, found, fix)
 
 
 def check_camera() -> Check:

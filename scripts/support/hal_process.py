@@ -9,6 +9,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from hal.base.errors import HalError
+from hal.base.output_folder import create_file
 from hal.bus.session import BusConfig
 from scripts.support.scene_options import SceneOptions
 
@@ -30,7 +31,7 @@ class HalProcess:
 
     def __init__(self, scene: SceneOptions, bus: BusConfig, log: Path, hal: str = "sim") -> None:
         self._log, self._ready = log, False
-        with log.open("wb") as stderr:
+        with create_file(log) as stderr:
             self._process = subprocess.Popen(
                 [sys.executable, "-P", "-m", "scripts.cli", "hal", "--options-from-stdin"],
                 stdin=subprocess.PIPE,

@@ -81,7 +81,7 @@ def _load_settings(folder: Path) -> RuntimeConfig:
     path = folder / "summary.json"
     try:
         settings = json.loads(path.read_text(encoding="utf-8"))["run"]["settings"]
-    except (OSError, KeyError, json.JSONDecodeError) as error:
+    except (OSError, KeyError, TypeError, ValueError, RecursionError) as error:
         raise TuneError(
             f"tune: {path} has no settings of the run. Give the --out of a `./z1 bench` that has completed.",
             code="no_settings",

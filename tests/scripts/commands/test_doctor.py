@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import resource
 import socket
 from functools import partial
 from pathlib import Path
@@ -15,6 +16,7 @@ from hal.base.clock import WallClock
 from hal.bus.server import HalServer
 from hal.bus.session import BusConfig
 from hal.servo.servo import Servo
+from hal.servo.servo_thread import may_lock_memory
 from scripts.commands import doctor
 from scripts.support import doctor_checks as checks
 from scripts.support.doctor_checks import Check, State
@@ -136,3 +138,14 @@ def test_arm_is_probed_on_its_own_network_only(monkeypatch: pytest.MonkeyPatch) 
 def test_doctor_uses_the_root_of_this_checkout() -> None:
     assert (checks.ROOT / "pyproject.toml").is_file()
     assert Path(doctor.__file__).is_relative_to(checks.ROOT)
+
+
+@pytest.mark.parametrize(
+    ("hard_limit", "state"), [(resource.RLIM_INFINITY, State.OK), (512 << 20, State.WARN), (64 << 20, State.WARN)]
+)
+def test_locked_memory_is_granted_where_the_servo_uses_it(
+    monkeypatch: pytest.MonkeyPatch, hard_limit: int, state: State
+) -> None:
+    monkeypatch.setattr(resource, "getrlimit", lambda _: (hard_limit, hard_limit))
+    assert checks.check_locked_memory().state is state
+    assert may_lock_memory() is (state is State.OK)
