@@ -6,7 +6,7 @@ import os
 
 from hypothesis import settings
 
-pytest_plugins = ["tests.support.faults_table"]
+pytest_plugins = ["tests.support.faults_table", "tests.support.vendor.table"]
 
 # The same examples in every run, so that a failure is reproducible; to search for new ones:
 # HYPOTHESIS_PROFILE=explore ./z1 test

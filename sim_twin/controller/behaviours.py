@@ -125,12 +125,16 @@ class TwistTracking:
 
     def __init__(self, q: np.ndarray, servos: Servos, kinematics: PivotKinematics) -> None:
         self._q, self._servos, self._kinematics = q, servos, kinematics
+        self._blocked: Command | None = None
 
     def step(self, command: Command, q: np.ndarray, dt_s: float) -> JointCommands:
         dq = np.zeros(z1.N_JOINTS)
         if command.track:
             move = command.trajectory()
-            dq[: z1.N_ARM] = self._joint_speed(move.poses[0], dt_s)
+            # Finding that no pose is in reach takes several steps: once for a command is enough
+            if command is not self._blocked:
+                dq[: z1.N_ARM] = self._joint_speed(move.poses[0], dt_s)
+                self._blocked = command if move.poses[0].any() and not dq.any() else None
             jaw, reach = np.clip(move.gripper_rad, *TRACKED_GRIPPER_RAD), TRACKING_SPEED * dt_s
             self._q = self._q + dq * dt_s
             self._q[z1.N_ARM] += np.clip(jaw - self._q[z1.N_ARM], -reach, reach)

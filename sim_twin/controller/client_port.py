@@ -15,8 +15,8 @@ QUEUE_LENGTH = 202
 """Datagrams that the kernel keeps for the controller; later ones are lost (measured: a backlog of 0.41 s at most)."""
 RECEIVE_TIMEOUT_S = 0.101
 """Wait for a datagram in each cycle [s]; without a client the answers come at this period (measured)."""
-WATCHDOG_TIMEOUTS = 22
-"""Cycles without a datagram until PASSIVE is requested: 2.2 s (measured: 2.15 s to 2.25 s)."""
+WATCHDOG_TIMEOUTS = 21
+"""Cycles without a datagram until PASSIVE is requested; the next answer shows it, after 2.2 s (measured)."""
 
 
 class ClientPort:

@@ -150,7 +150,7 @@ class Controller:
                 self.planner.labels[label] = self.measured.q[: z1.N_ARM].copy()
         elif state in MOVES:
             try:
-                return self.planner.plan(command, state, start)
+                return self.planner.plan(command, state, start, self.measured.q)
             except ProtocolError as error:
                 self._reject(command, error)
         return Motion()

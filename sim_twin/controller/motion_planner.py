@@ -49,8 +49,14 @@ class MotionPlanner:
         """Return the posture (6,) [rad, m] of the pivot at arm joints `q` (6,) [rad]."""
         return posture_from_pose(self.kinematics.forward(q))
 
-    def plan(self, command: Command, state: Fsm, start: np.ndarray) -> Motion:
-        """Return the motion of a state from `start` (7,) [rad].
+    def plan(self, command: Command, state: Fsm, start: np.ndarray, measured: np.ndarray) -> Motion:
+        """Return the motion of a state.
+
+        Args:
+            command: its body.
+            state: the state.
+            start: (7,) reference of the position servos [rad].
+            measured: (7,) measured joints [rad], from which MOVEC starts (measured on the vendor's controller).
 
         Raises:
             ProtocolError: the body does not fit the state.
@@ -60,6 +66,8 @@ class MotionPlanner:
                 goal = np.append(self.labels["startFlat"], z1.GRIPPER_CLOSED)
                 return Motion((JointPath(start, goal, LABEL_SPEED),))
             case Fsm.MOVEJ | Fsm.MOVEL | Fsm.MOVEC:
+                if state is Fsm.MOVEC:
+                    start = np.append(measured[: z1.N_ARM], start[z1.N_ARM])
                 return self._plan_move(command.trajectory(), state, start)
             case Fsm.TRAJECTORY:
                 return self._plan_show(start)

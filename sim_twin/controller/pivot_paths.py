@@ -31,12 +31,12 @@ _ENDLESS_M = 1e3  # far beyond the arm's reach
 
 
 class _PivotPath(ABC):
-    """Path of the pivot; where a pose of it is out of reach, the arm holds."""
+    """Path of the pivot; from the first pose out of reach on the arm holds, as finding none takes several steps."""
 
     def __init__(self, kinematics: PivotKinematics, start: np.ndarray, gripper: float, profile: SCurve) -> None:
         self._kinematics, self._q, self._profile = kinematics, start, profile
         self._jaw_start, self._jaw_step = start[z1.N_ARM], gripper - start[z1.N_ARM]
-        self._time_s = 0.0
+        self._time_s, self._blocked = 0.0, False
         self.duration_s = profile.duration_s
 
     @abstractmethod
@@ -45,8 +45,10 @@ class _PivotPath(ABC):
 
     def sample(self, t_s: float) -> tuple[np.ndarray, np.ndarray]:
         s, _ = self._profile.sample(t_s)
-        last = self._q
-        arm = self._kinematics.inverse(self.pose(s), last[: z1.N_ARM], _MAX_CHANGE_RAD)
+        last, arm = self._q, None
+        if not self._blocked:
+            arm = self._kinematics.inverse(self.pose(s), last[: z1.N_ARM], _MAX_CHANGE_RAD)
+            self._blocked = arm is None
         self._q = np.append(last[: z1.N_ARM] if arm is None else arm, self._jaw_start + s * self._jaw_step)
         elapsed_s, self._time_s = t_s - self._time_s, t_s
         speed = (self._q - last) / elapsed_s if elapsed_s > 0.0 and s < 1.0 else np.zeros(z1.N_JOINTS)
