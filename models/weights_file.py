@@ -31,7 +31,7 @@ def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> str:
     """
     if path.suffix != ".npz":
         raise InvalidValueError(f"{path} must end in .npz: weights are kept as NumPy arrays.", code="weights_suffix")
-    from hal.base.files import atomic_path, atomic_write  # needs yaml, which an environment of a generator's own lacks
+    from hal.base.files import atomic_path, atomic_write  # a generator's own process writes no weights
 
     with atomic_path(path) as partial:
         with partial.open("wb") as file:

@@ -16,7 +16,6 @@ from reprlib import repr as short_repr
 from typing import TYPE_CHECKING, Any, TypeVar, get_type_hints
 
 from hal.base.errors import ConfigError
-from hal.base.strict_yaml import StrictYamlError, load_strict
 
 if TYPE_CHECKING:
     import numpy as np
@@ -39,6 +38,8 @@ def read_yaml(path: Path, what: str) -> Any:
     Raises:
         ConfigError: `unreadable` or `not_yaml`.
     """
+    from hal.base.strict_yaml import StrictYamlError, load_strict
+
     try:
         return load_strict(read_text(path))
     except OSError as error:

@@ -138,7 +138,7 @@ class Command:
             ProtocolError: not 1 to 10 printable ASCII characters.
         """
         name = self.body[:_LABEL_SIZE].split(b"\0", 1)[0]
-        if not name or name[0] == 0x20 or not all(0x20 <= byte < 0x7F for byte in name):
+        if not name or not all(0x20 <= byte < 0x7F for byte in name):
             raise ProtocolError(
                 f"a label is {name!r}; allowed are 1 to {_LABEL_SIZE} printable ASCII characters.", code="label"
             )

@@ -150,7 +150,7 @@ class EpisodeRobot:
                 self._robot.move_to(motion.q[-1])
                 self._executor.execute(_reversed(motion))
                 self._executor.settle()
-        self._robot.home(jaw=jaw_home)
+        self._robot.home(jaw=jaw_home, drop=True)
 
     def _grasp_and_lift(self, plan: GraspPlan, carry_motion: JointTrajectory, known: dict[str, Any]) -> None:
         """Execute all motions, and write each figure into `known` as soon as it is known."""
