@@ -172,7 +172,7 @@ class StatusLogger:
             if now_s - self._clipped_s > _EPISODE_GAP_S:
                 log.warning(
                     "servo: the arm does not go where it is commanded: setpoints are beyond its joint limits or its "
-                    "speed, and it moves to the nearest that is allowed. Check the targets of the client. The next "
-                    "line like this is about another episode."
+                    "speed, or it lags behind them, and it moves to the nearest that is allowed. Check the targets of "
+                    "the client. The next line like this is about another episode."
                 )
             self._clipped_count, self._clipped_s = clipped_count, now_s

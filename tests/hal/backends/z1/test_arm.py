@@ -16,6 +16,7 @@ from hal.base.clock import ManualClock
 from hal.base.errors import CommandRejectedError, HalTimeoutError, NotConnectedError
 from hal.base.messages import ArmSetpoint, ServoMode, TrajectoryChunk
 from hal.base.z1_kinematics import posture_from_pose
+from hal.servo.limits import SPEED_TOLERANCE
 from hal.servo.servo import Servo
 from hal.z1_protocol.controller import COMMAND_SIZE, LABELS, STATE_SIZE, TrajectoryCommand
 from hal.z1_protocol.records import MotorError, MotorLink
@@ -195,7 +196,7 @@ def test_a_far_target_is_handed_over_one_period_at_a_time(bench: Bench) -> None:
     for _ in range(100):
         bench.tick(goal)
     sent = np.array([c.joints().q for c in bench.peer.received if c.track])
-    assert np.abs(np.diff(sent, axis=0)).max() <= z1.DQ_MAX[0] * PERIOD_S + 1e-6
+    assert np.abs(np.diff(sent, axis=0)).max() <= SPEED_TOLERANCE * z1.DQ_MAX[0] * PERIOD_S + 1e-6
     assert (np.abs(sent[-1] - bench.peer.q)[0]) < 0.05
 
 
