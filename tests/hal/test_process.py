@@ -11,7 +11,6 @@ from threading import Event
 
 import numpy as np
 import pytest
-from z1_runtime.devices import connect_remote
 
 from hal.backends.mock_arm import MockArm, make_rig
 from hal.backends.no_camera import NoCamera
@@ -23,7 +22,7 @@ from hal.bus.service import Listener
 from hal.bus.session import BusConfig, open_session
 from hal.parking import Parking
 from hal.process import serve
-from hal.rig import Rig
+from hal.rig import Rig, connect_remote
 from hal.servo.servo import Servo
 from tests.support.errors import raises
 

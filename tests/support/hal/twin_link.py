@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from sim_twin.clock import TwinClock
-
 from hal.base import z1
 from hal.base.clock import Clock
+from sim_twin.backends import TwinClock
 from sim_twin.controller.controlled_world import ControlledWorld
 from tests.support.hal.z1_peer import MemoryLink
 
