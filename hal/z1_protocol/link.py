@@ -146,3 +146,4 @@ class SharedLink(UdpLink):
         shared = socket.socket(fileno=fd)
         super().__init__(shared.getpeername(), shared.getsockname())
         self._socket = shared
+        self._poll.register(shared, select.POLLIN)

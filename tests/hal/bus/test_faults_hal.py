@@ -7,6 +7,8 @@ import signal
 import numpy as np
 import pytest
 
+from hal.backends.z1.config import Z1ArmConfig
+from hal.backends.z1.keeper.owner import take_over
 from hal.base import z1
 from hal.base.errors import HalTimeoutError
 from hal.bus.client import RemoteArm
@@ -74,6 +76,7 @@ def test_a_killed_hal_leaves_an_arm_that_holds(faults_table: FaultsTable) -> Non
                     arm.read_state()
         finally:
             end_processes(hal)
+            take_over((Z1ArmConfig().local_host, state_port))
     after = [step for step in world.steps if step[0] > killed_s]
     moving_s = [t_s for t_s, _, dq in after if np.abs(dq[: z1.N_ARM]).max() > 0.02]
     further = np.abs(after[-1][1] - q)[: z1.N_ARM].max()

@@ -99,7 +99,6 @@ def test_the_real_driver_moves_the_twin(twin: WireProcess, mode: Z1Mode) -> None
     assert twin.running  # as a real controller does without a client
 
 
-@pytest.mark.xfail(strict=True, reason="the driver's state requests have no body")
 def test_the_real_driver_reads_the_twins_faults(twin: WireProcess) -> None:
     arm = WireSimArm(twin, WallClock())
     arm.connect()

@@ -188,7 +188,7 @@ ARM_CASES: list[tuple[str, Callable[[], AbstractContextManager[ArmCase]]]] = [
     ("remote", remote_arm),
 ]
 CAMERA_CASES: list[tuple[str, Callable[[], AbstractContextManager[CameraCase]]]] = [
-    *((name, partial(registered_camera, name)) for name in CAMERAS.names() if name != "d405"),
+    *((name, partial(registered_camera, name)) for name in CAMERAS.names() if name not in ("d405", "none")),
     ("d405 over the twin", d405_over_the_twin),
     ("remote", remote_camera),
 ]

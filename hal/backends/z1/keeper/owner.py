@@ -7,6 +7,7 @@ import json
 import logging
 import os
 import socket
+import stat
 import subprocess
 import sys
 from threading import Event, Lock, Thread
@@ -41,6 +42,11 @@ def take_over(local: tuple[str, int]) -> bool:
     control.hand_over(local)
     _LOG.info("Z1: took over the arm from keeper %d", keeper.pid)
     return True
+
+
+def _error_stream() -> int | None:
+    """Return None for a keeper that shares this process's stderr: not a pipe, whose reader would wait for its end."""
+    return subprocess.DEVNULL if stat.S_ISFIFO(os.fstat(2).st_mode) else None
 
 
 class KeeperOwner:
@@ -139,6 +145,7 @@ class KeeperOwner:
             pass_fds=(self._link, self._page_file, theirs.fileno()),
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
+            stderr=_error_stream(),
             start_new_session=True,  # a closed terminal must not end it
         )
         theirs.close()

@@ -65,7 +65,12 @@ def test_a_controller_without_answers(mode: Z1Mode, faults_table: FaultsTable) -
 @pytest.mark.integration
 def test_a_controller_switched_by_another_program(faults_table: FaultsTable) -> None:
     bench = WireBench()
-    bench.play(lambda: bench.twin.receive(encode_command(Fsm.CARTESIAN)))
+
+    def request_three_times() -> None:  # of two datagrams in 4 ms the controller obeys the newer one, which is ours
+        for _ in range(3):
+            bench.twin.receive(encode_command(Fsm.CARTESIAN))
+
+    bench.play(request_three_times)
     bench.assert_safe()
     assert bench.status.mode is ServoMode.STOPPED
     assert "from JOINTCTRL to CARTESIAN without a request" in bench.status.reason
