@@ -176,8 +176,8 @@ def in_a_new_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ("arguments", "code", "text"),
     [
         (["board", "--columns=60"], 1, "180 markers"),
-        (["hand-eye", "--samples=missing"], 1, "missing"),
-        (["intrinsics", "--samples=missing"], 1, "missing"),
+        (["hand-eye", "--samples=missing"], 2, "missing"),
+        (["intrinsics", "--samples=missing"], 2, "missing"),
         (["capture", "--board-x-m=2"], 2, "x_m is out of reach (2.0"),
         (["capture", "--poses=0"], 2, "poses 0"),
         (["capture", "--speed=7"], 2, "speed 7.0"),
