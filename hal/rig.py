@@ -180,9 +180,7 @@ def connect_remote(bus: BusConfig, owner: str, *, camera: bool = True) -> Iterat
     # Disconnecting releases the lease, also after the HAL process has ended.
     with RemoteArm(bus, owner, clock) as arm:
         if not camera:
-            from hal.backends.no_camera import NoCamera
-
-            yield Devices(arm=arm, camera=NoCamera(), clock=clock)
+            yield Devices(arm=arm, camera=CAMERAS.make("none"), clock=clock)
             return
         with RemoteCamera(bus, clock) as remote_camera:
             yield Devices(arm=arm, camera=remote_camera, clock=clock)
