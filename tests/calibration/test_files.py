@@ -48,6 +48,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path / "s"
 
 
+@pytest.mark.integration
 def test_samples_come_back_as_they_were_taken(folder: Path) -> None:
     assert [save_sample(folder, sample(i)) for i in range(3)] == ["0001", "0002", "0003"]
     loaded = load_samples(folder)
@@ -59,6 +60,7 @@ def test_samples_come_back_as_they_were_taken(folder: Path) -> None:
     np.testing.assert_allclose(loaded.samples[1].T_base_flange, T_FLANGE_CAMERA, atol=1e-15)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(
     "damage",
     [

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from calibration.board.detection import BoardView
 from calibration.camera_model import CameraModel
@@ -35,6 +36,7 @@ def views(n: int, *, tilt_deg: float = 40.0, spread: float = 0.35, seed: int = 0
     return found
 
 
+@pytest.mark.integration
 def test_the_camera_is_found_within_its_own_standard_deviations() -> None:
     result = calibrate_intrinsics(views(20), BOARD)
     matrix, true = result.camera.matrix, TRUE.matrix
@@ -84,6 +86,7 @@ def test_too_few_views_and_mixed_sizes_are_rejected() -> None:
         calibrate_intrinsics(mixed, BOARD)
 
 
+@pytest.mark.integration
 def test_the_result_is_kept_and_reported(tmp_path: Path) -> None:
     result = calibrate_intrinsics(views(10), BOARD)
     calibration = CalibrationResult.of_intrinsics(

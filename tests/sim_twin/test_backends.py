@@ -27,6 +27,7 @@ def rig() -> Iterator[Rig]:
     rig.arm.disconnect()
 
 
+@pytest.mark.integration
 def test_the_registry_makes_the_twin_by_name_and_it_keeps_the_contracts() -> None:
     assert isinstance(ARMS.make("sim"), TwinArm)
     assert isinstance(CAMERAS.make("sim"), TwinCamera)
@@ -79,6 +80,7 @@ def test_frames_come_thirty_times_a_second_and_count_up(rig: Rig) -> None:
         assert 0 <= frame.stamp_s - number / 30 <= z1.CONTROL_PERIOD_S
 
 
+@pytest.mark.integration
 def test_a_frame_holds_colour_depth_and_the_objects_mask(rig: Rig) -> None:
     assert isinstance(rig.camera, Camera)
     frame: RgbdFrame = rig.camera.wait_for_frame(0.1)
@@ -105,6 +107,7 @@ def test_without_noise_depth_is_whole_and_colour_clean() -> None:
     assert (first.colour != second.colour).mean() < 1e-4
 
 
+@pytest.mark.integration
 def test_no_time_for_a_frame_is_a_timeout_that_says_how_long_to_wait(rig: Rig) -> None:
     before = rig.clock.now_s()
     with raises(HalTimeoutError, "timeout"):
@@ -112,6 +115,7 @@ def test_no_time_for_a_frame_is_a_timeout_that_says_how_long_to_wait(rig: Rig) -
     assert rig.clock.now_s() == pytest.approx(before + 0.01)
 
 
+@pytest.mark.integration
 def test_nothing_works_before_connect_and_disconnect_is_harmless() -> None:
     arm, camera = TwinArm(), TwinCamera()
     arm.disconnect()
@@ -126,12 +130,14 @@ def test_nothing_works_before_connect_and_disconnect_is_harmless() -> None:
         _ = camera.intrinsics
 
 
+@pytest.mark.integration
 def test_send_clamps_as_the_vendors_controller_does_and_says_so(rig: Rig) -> None:
     applied = rig.arm.send(ArmSetpoint(q=np.full(7, 9.0), dq=np.full(7, -50.0)))
     np.testing.assert_array_equal(applied.q, z1.Q_MAX)
     np.testing.assert_array_equal(applied.dq, -z1.DQ_MAX)
 
 
+@pytest.mark.integration
 def test_stop_holds_where_the_arm_is(rig: Rig) -> None:
     q = rig.arm.read_state().q
     rig.arm.send(ArmSetpoint(q=q + 0.5 * np.eye(7)[0], dq=np.zeros(7)))
@@ -144,6 +150,7 @@ def test_stop_holds_where_the_arm_is(rig: Rig) -> None:
     np.testing.assert_allclose(rig.arm.read_state().dq, 0.0, atol=1e-3)
 
 
+@pytest.mark.integration
 def test_in_lock_step_reading_moves_nothing(rig: Rig) -> None:
     for _ in range(10):
         assert rig.arm.read_state().stamp_s == 0.0
@@ -165,6 +172,7 @@ def test_in_real_time_reading_drives_the_world_and_drops_what_is_too_late() -> N
     assert world.time_s <= 0.032 + 1e-9
 
 
+@pytest.mark.integration
 def test_the_camera_may_be_read_from_another_thread_than_it_was_opened_in(rig: Rig) -> None:
     frames: list[RgbdFrame] = []
     thread = threading.Thread(target=lambda: frames.append(rig.camera.wait_for_frame(1.0)))

@@ -6,6 +6,7 @@ from sim_twin.model.scene import SceneConfig
 from sim_twin.model.world import World
 
 
+@pytest.mark.integration
 def test_sleeping_steps_the_world_and_calls_every_tick_first() -> None:
     world = World(SceneConfig(object="cylinder"))
     clock = TwinClock(world)

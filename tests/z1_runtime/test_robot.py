@@ -70,6 +70,7 @@ def test_move_to_a_pose_puts_the_pivot_there(robot: Robot) -> None:
     assert state.q[-1] == pytest.approx(-0.5, abs=1e-3)
 
 
+@pytest.mark.integration
 def test_home_is_the_observation_posture_and_keeps_the_jaw(robot: Robot) -> None:
     robot.move_to(z1.Q_HOME + 0.1, jaw=-0.2)
     np.testing.assert_allclose(robot.home().q, np.append(z1.Q_HOME, -0.2), atol=1e-3)
@@ -91,6 +92,7 @@ def mock_of(robot: Robot) -> MockArm:
     return servo.arm
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(
     "open_jaws",
     [
@@ -109,12 +111,14 @@ def test_jaws_that_hold_an_object_are_not_opened(loaded: Robot, open_jaws: Calla
     assert loaded.arm.status().trajectory_id == before.trajectory_id
 
 
+@pytest.mark.integration
 def test_jaws_that_hold_an_object_carry_it_and_open_on_request(loaded: Robot) -> None:
     assert loaded.move_to(z1.Q_HOME + 0.05).q[z1.N_ARM] == pytest.approx(-0.5, abs=1e-3)
     mock_of(loaded).block(None)
     assert loaded.home(jaw=-1.0, drop=True).q[z1.N_ARM] == pytest.approx(-1.0, abs=1e-3)
 
 
+@pytest.mark.integration
 def test_jaws_closed_on_nothing_open(robot: Robot) -> None:
     robot.move_to(z1.Q_HOME, jaw=0.0)
     assert robot.home(jaw=-1.0).q[z1.N_ARM] == pytest.approx(-1.0, abs=1e-3)

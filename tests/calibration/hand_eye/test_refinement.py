@@ -37,6 +37,7 @@ def problem_of(recording: Recording, *, camera_on_flange: bool = True) -> tuple[
     return data, fit
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("camera_on_flange", [True, False])
 def test_exact_corners_give_the_exact_camera_in_few_steps(
     camera_on_flange: bool, monkeypatch: pytest.MonkeyPatch
@@ -55,6 +56,7 @@ def test_exact_corners_give_the_exact_camera_in_few_steps(
     assert len(evaluations) < 60
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("camera_on_flange", [True, False])
 def test_jacobian_is_the_derivative_of_the_residuals(camera_on_flange: bool) -> None:
     recording = record(1, 5)
@@ -69,6 +71,7 @@ def test_jacobian_is_the_derivative_of_the_residuals(camera_on_flange: bool) -> 
         np.testing.assert_allclose(J[:, column], numeric, rtol=1e-4, atol=1e-4 * np.abs(J).max())
 
 
+@pytest.mark.integration
 def test_dropped_samples_have_no_influence() -> None:
     recording = record(2, 10)
     data, start = problem_of(recording)
@@ -80,6 +83,7 @@ def test_dropped_samples_have_no_influence() -> None:
     np.testing.assert_allclose(found.T_mount_camera, expected.T_mount_camera, atol=2e-5)
 
 
+@pytest.mark.integration
 def test_covariance_covers_the_errors_of_many_captures() -> None:
     squared = []
     for seed in range(6):

@@ -123,6 +123,7 @@ def test_a_few_wrong_corners_do_no_harm() -> None:
     assert pose_distances_mm_deg(result.T_flange_camera, T_FLANGE_CAMERA)[0] <= 0.5
 
 
+@pytest.mark.integration
 def test_without_refinement_the_poses_alone_do() -> None:
     result = solved(record(0), refine=False)
     assert result.rms_px is None

@@ -83,6 +83,7 @@ def test_the_state_has_seven_joints_and_stamps_that_rise(ready: ArmCase) -> None
     assert 0.05 < second.stamp_s - first.stamp_s < 0.2
 
 
+@pytest.mark.integration
 def test_a_connected_arm_holds_still(ready: ArmCase) -> None:
     before = ready.arm.read_state().q
     ready.clock.sleep_until(ready.clock.now_s() + 0.3)

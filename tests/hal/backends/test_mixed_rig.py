@@ -23,6 +23,7 @@ def state_at(q: np.ndarray) -> ArmState:
     return ArmState(stamp_s=0.0, q=q, dq=np.zeros(z1.N_JOINTS), tau=np.zeros(z1.N_JOINTS))
 
 
+@pytest.mark.integration
 def test_the_twins_camera_renders_the_measured_joints_of_the_rigs_arm() -> None:
     scene = SceneConfig(object="box", noise=False)
     rig = make_mixed_rig("mock", "sim", scene=scene)
@@ -52,6 +53,7 @@ def test_the_real_arm_keeps_its_search_its_return_and_its_parking_under_any_came
     assert rig.park is not None and rig.park.disable_motors == rig.arm.go_passive
 
 
+@pytest.mark.integration
 def test_the_twins_arm_has_the_scene_and_no_camera_of_its_own() -> None:
     scene = SceneConfig(arm_latency_s=0.004)
     rig = make_mixed_rig("sim", "none", scene=scene)

@@ -59,6 +59,7 @@ BAD_VALUES: dict[str, bytes] = {
 }
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("content", BAD_YAML.values(), ids=BAD_YAML.keys())
 def test_content_that_is_no_plain_yaml_is_one_line(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "c.yaml"

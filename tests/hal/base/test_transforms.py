@@ -25,6 +25,7 @@ def test_a_pose_times_its_inverse_is_the_identity(seed: int) -> None:
     np.testing.assert_allclose(Ts @ transforms.inverse(Ts), np.tile(np.eye(4), (3, 1, 1)), atol=1e-12)
 
 
+@pytest.mark.integration
 @given(SEEDS)
 def test_interpolation_is_lerp_and_slerp(seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -211,6 +211,7 @@ def test_a_truncated_message_is_always_rejected(data, draw):
         decode(data[:cut])
 
 
+@pytest.mark.integration
 @given(st.sampled_from(ENCODED), st.data())
 def test_mutated_bytes_give_a_message_or_a_rejection(data, draw):
     damaged = bytearray(data)

@@ -114,6 +114,7 @@ def test_the_path_ends_too_early_for_a_stop_near_its_end() -> None:
     assert path.can_stop_from(0.80)
 
 
+@pytest.mark.integration
 def test_a_stopped_arm_stays_on_its_path_if_it_bends() -> None:
     """The same path, played by the servo: from home along the circle, then the stop."""
     path = circle(1.5, 0.6)

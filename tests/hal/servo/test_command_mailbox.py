@@ -30,6 +30,7 @@ def test_a_start_away_from_the_arm_is_rejected_with_value_range_and_remedy() -> 
     assert bench.mode is HOLDING
 
 
+@pytest.mark.integration
 def test_a_start_within_the_tolerance_is_blended_in_without_a_jump() -> None:
     bench = Bench()
     near = START.copy()
@@ -190,6 +191,7 @@ def test_a_command_without_a_lease_is_rejected() -> None:
             command()
 
 
+@pytest.mark.integration
 def test_a_lease_without_heartbeat_lapses_once_the_arm_is_at_rest() -> None:
     bench = Bench(heartbeat_timeout_s=0.1)
     bench.servo.stream(move())
@@ -216,6 +218,7 @@ def test_a_command_accepted_while_the_tick_found_a_fault_is_dropped_by_rearm() -
     assert bench.commanded() == pytest.approx(np.tile(START, (len(bench.sent), 1)), abs=1e-9)
 
 
+@pytest.mark.integration
 def test_a_lapsed_lease_is_revived_by_its_owner_unless_another_client_claimed_it() -> None:
     bench = Bench(heartbeat_timeout_s=0.1)
     bench.run(1.1)

@@ -37,6 +37,7 @@ def pivot(q: np.ndarray) -> np.ndarray:
     return data.oMf[model.getFrameId("link06")].homogeneous @ z1.T_FLANGE_PIVOT
 
 
+@pytest.mark.integration
 @given(st.lists(st.floats(0.0, 1.0), min_size=7, max_size=7))
 def test_its_kinematics_are_the_urdfs(ratios: list[float]) -> None:
     q = z1.Q_MIN + np.array(ratios) * (z1.Q_MAX - z1.Q_MIN)
@@ -127,6 +128,7 @@ def test_a_trajectory_through_the_table_is_rejected_and_nothing_moves(guard: Gua
     assert np.array_equal(bench.commanded()[-1], START)
 
 
+@pytest.mark.integration
 def test_a_later_chunk_through_the_table_is_rejected_and_the_arm_brakes_before_it(guard: Guard) -> None:
     bench = Bench(guard=guard)
     whole = straight_down()

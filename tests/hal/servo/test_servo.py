@@ -43,6 +43,7 @@ def test_every_setpoint_is_on_the_trajectory() -> None:
     assert bench.commanded()[1:501, ARM] == pytest.approx(path[:, ARM], abs=1e-5)
 
 
+@pytest.mark.integration
 def test_chunks_are_joined_without_a_seam() -> None:
     whole, pieces = Bench(), Bench()
     whole.servo.stream(move())
@@ -101,6 +102,7 @@ def test_before_a_buffer_is_empty_the_arm_brakes_on_its_path_and_holds() -> None
     assert bench.servo.status().q_command == pytest.approx(held, abs=1e-12)
 
 
+@pytest.mark.integration
 def test_a_first_chunk_too_short_to_stop_on_waits_for_the_next_one_and_is_dropped_without() -> None:
     bench = Bench()
     bench.servo.stream(move(until_s=0.04))
@@ -196,6 +198,7 @@ def test_a_stop_brakes_at_the_next_tick_and_latches() -> None:
     assert bench.servo.status().q_command == pytest.approx(held, abs=1e-12)
 
 
+@pytest.mark.integration
 def test_rearm_clears_the_stop_and_frees_the_lease() -> None:
     bench = Bench()
     bench.servo.stream(move())
@@ -338,6 +341,7 @@ def test_braking_stays_within_speed_acceleration_and_jerk() -> None:
 # --- Replacement ----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.integration
 def test_a_trajectory_replaced_in_motion_stops_on_its_path_and_the_new_one_begins_at_its_start() -> None:
     bench = Bench()
     bench.servo.stream(move())
@@ -427,6 +431,7 @@ def drop_commands(bench: Bench) -> None:
     bench.arm.drop_commands = True
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(
     ("inject", "limits", "reason"),
     [
@@ -449,6 +454,7 @@ def test_an_arm_that_does_not_follow_latches_the_stop_and_yields(
     assert abs(torque[0]) < 0.1 * TAU_MAX[0], "at rest the command has yielded to the measurement"
 
 
+@pytest.mark.integration
 def test_an_arm_blocked_while_it_brakes_for_a_stop_yields_too_and_only_once() -> None:
     bench = Bench()
     bench.servo.stream(move())
@@ -493,6 +499,7 @@ def test_an_arm_without_measurements_is_braked_open_loop_and_latched() -> None:
     assert bench.mode is HOLDING
 
 
+@pytest.mark.integration
 def test_an_arm_that_rejects_commands_is_latched_and_gets_no_more() -> None:
     bench = Bench()
     bench.servo.stream(move())
@@ -514,6 +521,7 @@ def test_an_arm_that_rejects_commands_is_latched_and_gets_no_more() -> None:
 # --- Limits ---------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.integration
 def test_the_gripper_squeezes_with_a_bounded_torque_and_keeps_squeezing() -> None:
     bench = Bench()
     close = np.zeros(N_JOINTS)
@@ -531,6 +539,7 @@ def test_the_gripper_squeezes_with_a_bounded_torque_and_keeps_squeezing() -> Non
     assert bench.arm.read_state().tau[N_ARM] == pytest.approx(3.0, rel=1e-6)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("grip", ["as desired", "as sent"])
 def test_a_motion_with_a_held_object_starts_from_the_gripper_command(grip: str) -> None:
     bench = Bench()
@@ -563,6 +572,7 @@ def test_a_latched_stop_and_its_end_are_logged_once_each(caplog: pytest.LogCaptu
     assert second == "servo: re-armed"
 
 
+@pytest.mark.integration
 def test_clipping_is_logged_once_an_episode_with_its_meaning(caplog: pytest.LogCaptureFixture) -> None:
     bench = Bench()
     beyond = START.copy()
@@ -575,6 +585,7 @@ def test_clipping_is_logged_once_an_episode_with_its_meaning(caplog: pytest.LogC
     assert "beyond its joint limits" in caplog.text
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("offset", [-0.0003, 0.0])
 def test_an_arm_at_rest_on_a_joint_limit_is_not_clipped(offset: float, caplog: pytest.LogCaptureFixture) -> None:
     folded = np.zeros(N_JOINTS)

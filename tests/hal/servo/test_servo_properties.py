@@ -18,6 +18,7 @@ _FEW = 150
 _MANY = int(os.environ.get("Z1_SEQUENCES", "100000"))
 
 
+@pytest.mark.integration
 def test_a_few_random_sequences_of_legal_commands_have_no_violation() -> None:
     found, seed = run_sequences(range(_FEW))
     assert found.accepted > _FEW, "most chunks have to be accepted"

@@ -104,6 +104,7 @@ def test_values_that_are_not_finite_are_rejected() -> None:
         motor_board.encode_command(JointCommands(q=joints(7, np.inf)))
 
 
+@pytest.mark.integration
 def test_random_datagrams_are_decoded_or_rejected_and_nothing_else() -> None:
     rng = np.random.default_rng(6)
     outcomes = {"read": 0, "rejected": 0}

@@ -102,6 +102,7 @@ def test_boxes_and_masks_are_those_of_ultralytics(ours, checkpoint, shape):
     assert all(d.mask.shape == shape for d in found)
 
 
+@pytest.mark.integration
 def test_every_class_of_a_box_counts_as_in_ultralytics_validator(ours):
     """An untrained network gives every class a confidence nearly everywhere."""
     from ultralytics.utils.nms import non_max_suppression
@@ -153,6 +154,7 @@ def are_mirrored(a, b):
     return a.label == b.label and abs(a.confidence - b.confidence) < 1e-4 and close
 
 
+@pytest.mark.integration
 def test_a_network_with_other_anchors_processes_the_image_alone(ours, monkeypatch):
     monkeypatch.setattr("models.detector.detector.count_anchors", lambda _: -1)
     other, once = (
@@ -453,6 +455,7 @@ def test_the_most_confident_of_the_wanted_class_is_chosen():
     assert best_of(found, ("box",)) is None
 
 
+@pytest.mark.integration
 def test_listing_the_runtimes_loads_no_network_library(ours):
     """`./z1 --help` and the doctor's list must stay fast."""
     import subprocess

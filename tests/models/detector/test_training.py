@@ -19,6 +19,7 @@ from models.detector.training import (
 )
 
 
+@pytest.mark.integration
 def test_the_loss_in_bfloat16_differs_by_rounding_only() -> None:
     from ultralytics.cfg import get_cfg
     from ultralytics.nn.tasks import SegmentationModel

@@ -36,18 +36,21 @@ def test_a_saved_detector_is_small(saved):
     assert saved[1].stat().st_size < 7.2e6
 
 
+@pytest.mark.integration
 def test_the_wrong_number_of_names_writes_nothing(saved, tmp_path):
     with raises(WeightsError, "weights_other_network"):
         save_detector(tmp_path / "d.npz", saved[0], ("bottle", "box"))
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.integration
 def test_a_fused_model_writes_nothing(tmp_path):
     with raises(WeightsError, "weights_other_network"):
         save_detector(tmp_path / "d.npz", new_network(3).fuse(verbose=False))
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.integration
 def test_a_model_that_is_not_finite_writes_nothing(tmp_path):
     network = new_network(3)
     with torch.no_grad():

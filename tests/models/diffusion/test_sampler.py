@@ -48,6 +48,7 @@ def test_grasps_are_rigid_scored_and_best_first(sampler):
     assert grasps.widths_m.min() > 0.0
 
 
+@pytest.mark.integration
 def test_the_same_seed_gives_the_same_grasps_and_another_seed_others(sampler):
     points = make_bottle_view(0)[1]
     first, again, other = (sampler.sample(points, 50, seed) for seed in (3, 3, 4))
@@ -56,6 +57,7 @@ def test_the_same_seed_gives_the_same_grasps_and_another_seed_others(sampler):
     assert not np.allclose(first.T_camera_grasps, other.T_camera_grasps)
 
 
+@pytest.mark.integration
 def test_turning_the_camera_turns_the_grasps_and_nothing_else(sampler):
     points = make_bottle_view(1)[1]
     R = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]

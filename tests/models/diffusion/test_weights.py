@@ -8,6 +8,7 @@ from models.weights_file import WeightsError, verify_sha256
 from tests.support.errors import raises
 
 
+@pytest.mark.integration
 def test_weights_round_trip_through_the_file(tmp_path):
     generator, discriminator = Denoiser(), Discriminator()
     save_weights(tmp_path / "w.npz", generator, discriminator)

@@ -65,6 +65,7 @@ def test_grasps_cross_the_pipe_unchanged(served, tmp_path):
     assert grasps.source.startswith(f"fake ['fake', '{tmp_path}/weights.yml']")
 
 
+@pytest.mark.integration
 def test_one_process_serves_many_requests_until_close_and_a_new_one_after(served):
     first, again = served.sample(CLOUD, 1, 0).source, served.sample(CLOUD, 1, 0).source
     assert first == again
@@ -78,6 +79,7 @@ def test_a_bad_cloud_is_rejected_before_the_pipe(served):
     assert len(served.sample(CLOUD, 1, 0)) == 1
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(
     ("seed", "error", "code"),
     [
@@ -131,6 +133,7 @@ def test_a_failed_start_is_reported_with_the_last_lines_of_stderr(tmp_path):
         ProcessGenerator("fake", tmp_path, tmp_path / "python")
 
 
+@pytest.mark.integration
 def test_another_protocol_version_is_rejected(tmp_path):
     with raises(GeneratorError, "protocol_version"):
         make(tmp_path, 'pipe.write_message(out, {"protocol": 99})')

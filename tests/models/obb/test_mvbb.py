@@ -263,6 +263,7 @@ def test_the_combined_score_is_the_paper_formula():
     np.testing.assert_allclose(ranked.scores, [0.85, high], rtol=1e-9)
 
 
+@pytest.mark.integration
 @settings(max_examples=30)
 @given(seed=SEEDS, k=st.integers(1, 6), alpha=st.floats(0, 1))
 def test_ranked_scores_never_rise_and_belong_to_their_grasps(seed: int, k: int, alpha: float):
@@ -274,6 +275,7 @@ def test_ranked_scores_never_rise_and_belong_to_their_grasps(seed: int, k: int, 
     np.testing.assert_array_equal(ranked.grasps.scores, grasps.scores[ranked.indices])
 
 
+@pytest.mark.integration
 @settings(max_examples=20)
 @given(seed=SEEDS)
 def test_shuffling_the_grasps_does_not_change_the_ranking(seed: int):

@@ -60,6 +60,7 @@ def test_every_grasp_is_a_rigid_pose_with_a_score_and_a_width_within_the_opening
     assert (cylinder_grasps.widths_m > 0.0).all() and (cylinder_grasps.widths_m <= 0.085).all()
 
 
+@pytest.mark.integration
 def test_the_same_seed_gives_the_same_grasps_and_another_seed_others():
     cloud, sampler = make_cylinder_view(), AntipodalSampler()
     first, again, other = (sampler.sample(cloud, 100, seed) for seed in (4, 4, 5))

@@ -86,6 +86,7 @@ def test_no_grasp_approaches_from_behind():
     assert grasps.T_camera_grasps[:, 2, 2].min() > -0.8
 
 
+@pytest.mark.integration
 def test_most_grasps_of_boxes_and_cylinders_are_valid():
     valid = []
     for seed in range(6):

@@ -19,6 +19,8 @@ from scripts.calibrate.verify_hand_eye import Config, main
 from scripts.support.calibration_robot import RobotOptions, open_robot
 from sim_twin.model.scene import SceneConfig
 
+pytestmark = pytest.mark.integration
+
 MOUNT = SceneConfig(mount_error_m=0.005, mount_error_deg=2.0, mount_seed=1)
 OPTIONS = ("--mount-error-m=0.005", "--mount-error-deg=2", "--mount-seed=1")
 
@@ -37,7 +39,6 @@ def result_of(folder: Path) -> Path:
     return path
 
 
-@pytest.mark.integration
 def test_twin_is_calibrated_and_the_uncertainty_covers_the_error(calibrations: Path):
     found = load_newest(calibrations, "hand_eye", MOUNT.camera_serial())
     error_m, error_rad = pose_error(MOUNT.T_flange_camera(), found.T_flange_camera)
@@ -53,7 +54,6 @@ def test_report_and_recording_are_saved_with_the_result(calibrations: Path):
     assert result.with_suffix(".rrd").stat().st_size > 100_000
 
 
-@pytest.mark.integration
 def test_samples_are_solved_again_offline_into_a_new_version(calibrations: Path, tmp_path: Path):
     before = result_of(calibrations).read_bytes()
     arguments = [f"--samples={calibrations / 'samples'}", f"--calibrations={calibrations}"]
@@ -68,7 +68,6 @@ def test_samples_are_solved_again_offline_into_a_new_version(calibrations: Path,
             path.unlink()
 
 
-@pytest.mark.integration
 def test_a_damaged_sample_is_named_and_the_others_are_solved(calibrations: Path, tmp_path: Path, capfd):
     samples = tmp_path / "samples"
     samples.mkdir()
@@ -81,7 +80,6 @@ def test_a_damaged_sample_is_named_and_the_others_are_solved(calibrations: Path,
     assert name not in load_result(next(tmp_path.glob("hand_eye_*.json"))).samples["used"]
 
 
-@pytest.mark.integration
 def test_intrinsics_are_found_from_the_same_samples(calibrations: Path, tmp_path: Path):
     arguments = [f"--samples={calibrations / 'samples'}", f"--calibrations={tmp_path}"]
     assert cli.main(["calibrate", "intrinsics", *arguments]) == 0
@@ -91,7 +89,6 @@ def test_intrinsics_are_found_from_the_same_samples(calibrations: Path, tmp_path
     assert "<svg" in next(tmp_path.glob("intrinsics_*.html")).read_text()
 
 
-@pytest.mark.integration
 def test_tip_check_passes_with_the_result_and_not_without(calibrations: Path, tmp_path: Path):
     out = tmp_path / "tips.json"
     arguments = ["calibrate", "verify", f"--out={out}", "--corners=2", "--speed=1", *OPTIONS]
@@ -104,7 +101,6 @@ def test_tip_check_passes_with_the_result_and_not_without(calibrations: Path, tm
     assert not failed["passed"] and failed["max_mm"] > 4.0 and "drawing" in failed["calibration"]
 
 
-@pytest.mark.integration
 def test_on_a_real_arm_the_operator_types_the_offsets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     from scripts.calibrate import verify_hand_eye
 
@@ -138,7 +134,6 @@ class _NoGroundTruth:
 # --- Use by the demo ------------------------------------------------------------------------------
 
 
-@pytest.mark.integration
 def test_demo_reports_its_calibration_and_lifts_with_it(calibrations: Path, tmp_path: Path, capfd):
     arguments = ["demo", "--lockstep", f"--out={tmp_path}", f"--calibration={result_of(calibrations)}", *OPTIONS]
     assert cli.main(arguments) == 0
@@ -155,7 +150,6 @@ def test_demo_rejects_the_calibration_of_another_camera(calibrations: Path, tmp_
 # --- The other commands -------------------------------------------------------------------------------
 
 
-@pytest.mark.integration
 def test_a_board_is_written_that_the_detector_reads(tmp_path: Path):
     options = ["--columns=7", "--rows=5", "--square-m=0.03", "--marker-m=0.022"]
     assert cli.main(["calibrate", "board", f"--out={tmp_path / 'board.png'}", *options]) == 0
@@ -171,7 +165,6 @@ def in_a_new_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("Z1_CALIBRATIONS", str(tmp_path))
 
 
-@pytest.mark.integration
 @pytest.mark.parametrize(
     ("arguments", "code", "text"),
     [

@@ -70,6 +70,7 @@ def test_every_check_answers_on_this_machine() -> None:
         assert row.fix or row.state is State.OK
 
 
+@pytest.mark.integration
 def test_port_taken_by_another_program_prevents_the_demo(monkeypatch: pytest.MonkeyPatch) -> None:
     with socket.socket() as other:
         other.bind(("127.0.0.1", 0))
@@ -123,6 +124,7 @@ def test_missing_opengl_is_a_warning_with_its_fix(monkeypatch: pytest.MonkeyPatc
     assert "apt install" in row.fix
 
 
+@pytest.mark.integration
 def test_hanging_driver_times_out() -> None:
     code, out = checks._run_python("import threading; threading.Event().wait()", timeout_s=0.5)
     assert code != 0

@@ -81,6 +81,7 @@ def test_fitted_values_that_win_are_written_and_loaded_by_the_runtime(log, tmp_p
     assert main(Config(logs=(log,), out=out, resume=True)) == 0
 
 
+@pytest.mark.integration
 def test_without_a_winner_the_hand_set_values_are_written(log, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(runner, "run_tasks", twin(lambda method, n: n % 3 == 0))
     assert z1(["tune", str(log), "--out", str(tmp_path / "tune")]) == 0
@@ -92,6 +93,7 @@ def test_without_a_winner_the_hand_set_values_are_written(log, tmp_path, monkeyp
     assert scoring.full == ranking_of(RuntimeConfig())
 
 
+@pytest.mark.integration
 def test_nothing_is_run_when_that_is_forbidden(log, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(runner, "run_tasks", lambda *_: pytest.fail("--no-run was given"))
     assert z1(["tune", str(log), "--no-run", "--out", str(tmp_path / "tune")]) == 0

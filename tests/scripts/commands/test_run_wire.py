@@ -53,6 +53,7 @@ def test_a_client_is_answered_until_the_signal(spelling: str) -> None:
     assert "answers; 1 invalid datagrams (the last one: a command has 8 bytes" in summary
 
 
+@pytest.mark.integration
 def test_the_folded_arm_rests_on_itself_in_passive() -> None:
     config = Config()
     twin = make_twin(make_scene(config), config.wire, start_pose(config.start))
@@ -65,6 +66,7 @@ def test_the_folded_arm_rests_on_itself_in_passive() -> None:
     assert np.abs(dq).max() < 0.05
 
 
+@pytest.mark.integration
 def test_home_is_the_cameras_viewpoint() -> None:
     config = Config(start="home", object="box")
     twin = make_twin(make_scene(config), config.wire, start_pose(config.start))

@@ -36,6 +36,7 @@ def test_recording_holds_robot_and_objects_and_their_motion(tmp_path: Path) -> N
     assert sum(path.startswith("world/twin/world/geom") for path in paths) >= 2  # floor and table
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("name", ["bottle", "box", "cylinder"])
 def test_every_geom_of_the_scene_has_a_shape(name: str) -> None:
     model = World(SceneConfig(object=name)).model

@@ -34,6 +34,7 @@ def test_rays_and_egl_see_the_same_depth_and_the_same_object(name: str) -> None:
     assert np.percentile(error, 99) < 2e-3  # OpenGL draws cylinders with flat facets, and edges half a pixel apart
 
 
+@pytest.mark.integration
 @needs_egl
 def test_the_table_is_where_the_pinhole_and_the_mount_say() -> None:
     world = World(SceneConfig(object="cylinder"))
@@ -71,6 +72,7 @@ def test_from_home_every_object_is_seen_past_the_open_jaws_and_beyond_min_z(name
     renderer.close()
 
 
+@pytest.mark.integration
 def test_the_wrist_camera_does_not_see_its_own_housing() -> None:
     z_m = _draw(SceneConfig(object="cylinder"), "rays").z_m
     assert z_m[z_m > 0].min() > 0.04  # the gripper's back; the housing begins at 0 and the bracket behind it

@@ -38,6 +38,7 @@ def send(twin: ControlledWorld, data: bytes) -> None:
     twin.receive(data[:2] + bytes(4) + data[6:])
 
 
+@pytest.mark.integration
 def test_one_datagram_is_read_and_answered_a_cycle_and_the_others_queue(twin: ControlledWorld) -> None:
     answers = 0
     for _ in range(5000):
@@ -68,6 +69,7 @@ def test_a_full_queue_drops_the_newest(twin: ControlledWorld) -> None:
     assert twin.controller.fsm is Fsm.PASSIVE
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("state", [Fsm.JOINTCTRL, Fsm.CARTESIAN, Fsm.LOWCMD, Fsm.TEACH, Fsm.TOSTATE])
 def test_silence_ends_in_passive_and_the_answers_go_on(twin: ControlledWorld, state: Fsm) -> None:
     if state not in (Fsm.CARTESIAN, Fsm.LOWCMD):
@@ -86,6 +88,7 @@ def test_silence_ends_in_passive_and_the_answers_go_on(twin: ControlledWorld, st
     assert decode_state(twin.answer).state is Fsm.PASSIVE
 
 
+@pytest.mark.integration
 def test_any_datagram_restarts_the_watchdog(twin: ControlledWorld) -> None:
     send(twin, encode_command(Fsm.JOINTCTRL))
     for _ in range(10):
@@ -95,6 +98,7 @@ def test_any_datagram_restarts_the_watchdog(twin: ControlledWorld) -> None:
     assert twin.invalid_datagrams == 10
 
 
+@pytest.mark.integration
 def test_longer_packets_and_other_track_flags_are_obeyed(twin: ControlledWorld) -> None:
     send(twin, encode_command(Fsm.JOINTCTRL) + b"x")
     assert twin.controller.fsm is Fsm.JOINTCTRL
@@ -105,6 +109,7 @@ def test_longer_packets_and_other_track_flags_are_obeyed(twin: ControlledWorld) 
     assert run(twin, 0.5)[0] == pytest.approx(q[0], abs=0.01)
 
 
+@pytest.mark.integration
 def test_the_arm_stays_parked_until_the_first_command_and_then_sinks(twin: ControlledWorld) -> None:
     parked = run(twin, 0.5)
     assert not twin.port.connected
@@ -112,6 +117,7 @@ def test_the_arm_stays_parked_until_the_first_command_and_then_sinks(twin: Contr
     assert np.abs(run(twin, 0.5) - parked).max() > 0.1
 
 
+@pytest.mark.integration
 def test_joint_control_carries_the_arm_and_movej_reaches_its_goal(twin: ControlledWorld) -> None:
     before = twin.world.read_arm()[0]
     send(twin, encode_command(Fsm.JOINTCTRL))
@@ -159,6 +165,7 @@ def test_a_silent_board_leaves_stale_answers_and_is_recovered_from(twin: Control
     assert twin.answer != stale
 
 
+@pytest.mark.integration
 def test_gains_beyond_all_reason_do_not_break_the_physics(twin: ControlledWorld) -> None:
     big = np.full(7, 3e38)
     send(twin, encode_command(Fsm.LOWCMD, JointCommands(q=big, dq=-big, tau=-big, kp=big, kd=big)))
@@ -172,6 +179,7 @@ def test_gains_beyond_all_reason_do_not_break_the_physics(twin: ControlledWorld)
     assert twin.controller.fsm is Fsm.JOINTCTRL
 
 
+@pytest.mark.integration
 def test_random_bytes_and_mutilated_commands_are_counted_and_never_crash(twin: ControlledWorld) -> None:
     rng = np.random.default_rng(5)
     goods = [encode_command(state, make_body(state), track=bool(state % 2)) for state in Fsm]

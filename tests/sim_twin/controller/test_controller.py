@@ -54,6 +54,7 @@ def test_every_request_is_granted_or_ignored_as_in_the_table(present: Fsm) -> No
         assert seen is expected, requested.name
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("state", sorted(MOVES - {Fsm.TRAJECTORY}), ids=lambda s: s.name)
 def test_every_motion_falls_back_to_joint_control_by_itself(state: Fsm) -> None:
     arm = bring_to(state)

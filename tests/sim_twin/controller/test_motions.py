@@ -43,6 +43,7 @@ def durations() -> list[tuple[Fsm, TrajectoryCommand | str | None, np.ndarray, f
     ]
 
 
+@pytest.mark.integration
 def test_motions_take_as_long_as_on_the_vendors_controller() -> None:
     for state, body, start, expected_s in durations():
         arm = IdealArm(start)

@@ -103,6 +103,7 @@ def test_a_twist_is_slowed_down_to_the_speed_of_its_fastest_joint(arm: IdealArm)
     assert np.abs(arm.commands.dq).max() == pytest.approx(TWIST_JOINT_SPEED)
 
 
+@pytest.mark.integration
 def test_a_twist_out_of_reach_ends_in_holding(arm: IdealArm) -> None:
     arm.request(Fsm.CARTESIAN)
     arm.track(move_to(np.array([0, 0, 0, 0.5, 0, 0])))

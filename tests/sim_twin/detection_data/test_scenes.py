@@ -72,6 +72,7 @@ def test_labels_are_of_the_three_classes_large_enough_and_apart(renderer: SceneR
     assert seen >= 3
 
 
+@pytest.mark.integration
 @needs_egl
 def test_an_empty_scene_has_no_labels(renderer: SceneRenderer) -> None:
     for seed in range(4):

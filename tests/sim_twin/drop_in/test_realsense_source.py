@@ -95,6 +95,7 @@ def test_the_driver_undistorts_colour_onto_depth_to_a_fraction_of_a_pixel(patchw
     assert np.percentile(np.linalg.norm(error, axis=1), 95) < 0.25
 
 
+@pytest.mark.integration
 @needs_egl
 def test_colour_has_the_distortion_of_the_raw_imager(patchwork: World) -> None:
     with TwinSource(patchwork) as source:
@@ -103,6 +104,7 @@ def test_colour_has_the_distortion_of_the_raw_imager(patchwork: World) -> None:
     assert np.median(np.linalg.norm(error, axis=1)) > 5.0
 
 
+@pytest.mark.integration
 @needs_egl
 def test_the_right_image_is_shifted_by_the_disparity(patchwork: World) -> None:
     with TwinSource(patchwork) as source:
@@ -118,6 +120,7 @@ def test_the_right_image_is_shifted_by_the_disparity(patchwork: World) -> None:
     np.testing.assert_allclose(np.median(shift[known, 1]), 0.0, atol=0.1)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("size", list(MIN_Z_M))
 def test_every_stream_is_within_the_wide_image(size: tuple[int, int], source: TwinSource) -> None:
     optics = Optics(source.calibration, *size)
@@ -137,6 +140,7 @@ def test_no_depth_below_the_min_z_of_the_resolution(source: TwinSource) -> None:
     assert DEPTH_UNIT_M * depth[depth > 0].min() >= MIN_Z_M[1280, 720] - 1e-9
 
 
+@pytest.mark.integration
 def test_the_left_edge_without_stereo_overlap_is_empty(source: TwinSource) -> None:
     depth = expose(source, depth=True).depth
     assert depth is not None
@@ -153,6 +157,7 @@ def test_noise_differs_between_frames_and_is_reproducible(source: TwinSource) ->
         assert getattr(first, name).tobytes() != getattr(other, name).tobytes()
 
 
+@pytest.mark.integration
 def test_half_the_exposure_is_half_the_brightness(patchwork: World) -> None:
     with TwinSource(patchwork) as source:
         bright, dark = (expose(source, colour=True, brightness=b).colour for b in (1.0, 0.5))
@@ -161,6 +166,7 @@ def test_half_the_exposure_is_half_the_brightness(patchwork: World) -> None:
     np.testing.assert_allclose(dark, bright / 2, atol=1)
 
 
+@pytest.mark.integration
 def test_only_requested_images_are_made(source: TwinSource) -> None:
     exposure = expose(source, depth=True)
     assert exposure.depth is not None

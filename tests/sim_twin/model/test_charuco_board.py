@@ -84,6 +84,7 @@ def test_the_board_can_be_touched_and_the_object_is_out_of_reach(world: World):
     assert read_ground_truth(World(SceneConfig())).T_base_board is None
 
 
+@pytest.mark.integration
 def test_a_mount_off_its_drawing_is_off_by_what_was_asked_and_has_a_serial_of_its_own():
     moved = SceneConfig(mount_error_m=0.005, mount_error_deg=2.0, mount_seed=3)
     T = moved.T_flange_camera()

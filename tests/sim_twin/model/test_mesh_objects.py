@@ -28,6 +28,7 @@ def bracket() -> trimesh.Trimesh:
     return trimesh.util.concatenate([foot, post])
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("suffix", [".stl", ".obj", ".ply"])
 def test_a_concave_mesh_keeps_its_size_mass_and_hollow(tmp_path, suffix):
     name, grasp_object = load_mesh_object(write(tmp_path / f"bracket{suffix}", bracket()), 1e-3, 0.15)
@@ -79,6 +80,7 @@ def test_what_cannot_stand_is_held(tmp_path):
         assert World(SceneConfig(object=name, shape=grasp_object)).fixture_holds
 
 
+@pytest.mark.integration
 def test_the_second_time_nothing_is_decomposed(tmp_path, monkeypatch):
     import coacd
 

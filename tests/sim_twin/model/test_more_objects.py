@@ -16,6 +16,7 @@ def world(request: pytest.FixtureRequest) -> World:
     return World(SceneConfig(object=request.param))
 
 
+@pytest.mark.integration
 def test_it_stays_upright(world: World) -> None:
     start = world.config.T_base_object()
     world.advance_to(1.0)
@@ -25,6 +26,7 @@ def test_it_stays_upright(world: World) -> None:
     assert np.abs(world.data.qvel[-6:]).max() < 1e-2
 
 
+@pytest.mark.integration
 def test_it_is_drawn_at_its_pose(world: World) -> None:
     renderer = make_renderer(world.model, INTRINSICS, "rays")
     data = world.snapshot()

@@ -23,6 +23,7 @@ def test_objects_have_the_size_and_mass_they_are_sold_with(name: str, size_m: tu
     assert grasp_object.height_m == pytest.approx(size_m[2])
 
 
+@pytest.mark.integration
 def test_the_compiled_inertia_is_that_of_a_solid_cylinder() -> None:
     model = World(SceneConfig(object="cylinder")).model
     radius, height, mass = 0.030, 0.150, 0.20
@@ -30,6 +31,7 @@ def test_the_compiled_inertia_is_that_of_a_solid_cylinder() -> None:
     np.testing.assert_allclose(sorted(model.body("object").inertia), sorted([across, across, along]), rtol=1e-6)
 
 
+@pytest.mark.integration
 def test_the_water_pulls_the_bottles_centre_of_mass_below_its_middle() -> None:
     model = World(SceneConfig(object="bottle")).model
     assert model.body("object").mass[0] == pytest.approx(0.30)

@@ -46,6 +46,7 @@ def test_the_world_starts_at_home_with_open_jaws_and_everything_at_rest(world: W
     np.testing.assert_allclose(world.T_base_object()[:3, 3], [0.48, 0.0, 0.1], atol=1e-4)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("joint", range(z1.N_JOINTS))
 def test_a_move_of_one_radian_a_second_is_tracked_within_20_mrad_and_settles_within_2(joint: int) -> None:
     world = World(SceneConfig(object="cylinder", distance_m=0.65, lateral_m=0.25))
@@ -121,6 +122,7 @@ def test_a_held_object_is_lifted_and_neither_slips_nor_sinks_in(name: str) -> No
         assert np.rad2deg(make_homogeneous_lathe) < 1.0
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("pitch_deg", [-45.0, 45.0])
 def test_a_leaning_object_stays_put_until_touched(pitch_deg: float) -> None:
     world = World(SceneConfig(object="bottle", pitch_deg=pitch_deg))
@@ -149,6 +151,7 @@ def test_a_push_breaks_the_fixture_for_good() -> None:
     assert np.linalg.norm(world.T_base_object()[:3, 3] - world.config.T_base_object()[:3, 3]) > 0.015
 
 
+@pytest.mark.integration
 def test_closing_the_jaws_on_it_takes_the_object_out_of_the_fixture() -> None:
     world = World(SceneConfig(object="cylinder", pitch_deg=5.0))
     data, model = world.data, world.model
@@ -163,6 +166,7 @@ def test_closing_the_jaws_on_it_takes_the_object_out_of_the_fixture() -> None:
     assert world.lifted_m() > 0.05
 
 
+@pytest.mark.integration
 def test_a_snapshot_does_not_move_with_the_world() -> None:
     world = World(SceneConfig(object="cylinder"))
     before = world.snapshot()

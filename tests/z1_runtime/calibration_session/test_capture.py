@@ -27,6 +27,8 @@ from z1_runtime.geometry.kinematics import Kinematics
 from z1_runtime.motion.executor import Executor, MotionError
 from z1_runtime.motion.trajectory import MotionLimits, joint_move
 
+pytestmark = pytest.mark.integration
+
 BOARD = Board()
 
 
@@ -63,7 +65,6 @@ def folder(robot: CalibrationRobot, tmp_path_factory: pytest.TempPathFactory) ->
     return folder
 
 
-@pytest.mark.integration
 def test_interrupted_capture_is_continued(folder: Path):
     loaded = load_samples(folder)
     assert len(loaded.samples) == 3 and not loaded.warnings
@@ -114,7 +115,6 @@ class Operator:
         return self._keys.get(self._asked, "end" if self._asked > 100 else "")
 
 
-@pytest.mark.integration
 def test_a_guided_arm_is_sampled_when_it_holds_a_new_view_still(robot: CalibrationRobot, tmp_path: Path):
     capture = capture_into(tmp_path, robot)
     capture.open("2026-01-01T00:00:00+00:00")
@@ -140,7 +140,6 @@ def test_operator_captures_and_ends_and_nothing_moves_the_arm(robot: Calibration
     assert robot.arm.status().trajectory_id == before
 
 
-@pytest.mark.integration
 def test_table_without_the_board_is_reported(tmp_path: Path):
     with ExitStack() as undo:
         robot = undo.enter_context(connect_rig(make_rig(SceneConfig(object="box"), lockstep=True)))

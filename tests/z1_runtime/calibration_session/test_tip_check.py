@@ -43,12 +43,14 @@ def test_the_tip_is_brought_over_corners_far_apart(kinematics):
         assert np.linalg.norm(one.p_base_tip - one.p_base_target) < 2e-4  # the mock arm follows well
 
 
+@pytest.mark.integration
 def test_the_tip_comes_from_above_and_leaves_the_same_way(kinematics):
     bench, (one,) = touch(kinematics, flat_board(0.495, 0.10), n=1, approach_m=0.04)
     tip = (kinematics.pivot(bench.servo.read_state().q[: z1.N_ARM]) @ T_PIVOT_TIP)[:3, 3]
     assert np.linalg.norm(tip - one.p_base_target - [0.0, 0.0, 0.04]) < 2e-4
 
 
+@pytest.mark.integration
 def test_a_corner_out_of_reach_is_left_out_with_the_reason(kinematics):
     bench, (one,) = touch(kinematics, flat_board(1.2, 0.10), n=1)
     assert "no inverse kinematics solution" in one.failure and np.isnan(one.p_base_tip).all()

@@ -72,6 +72,7 @@ def views_of(kinematics: Kinematics, checker: CollisionChecker, T_base_board: np
     return find_viewpoints(kinematics, checker, INTRINSICS, T_base_board, BOARD.corners_m, **options)
 
 
+@pytest.mark.integration
 def test_each_view_has_its_camera_pose_and_the_board_in_view(kinematics, checker):
     T_base_board = flat_board(0.495, 0.10)
     for view in views_of(kinematics, checker, T_base_board):
@@ -97,12 +98,14 @@ def test_views_turn_about_more_than_one_axis_and_none_comes_twice(kinematics, ch
     assert np.linalg.svd(np.array(turns), compute_uv=False)[-1] > 0.3  # axes of turning span space
 
 
+@pytest.mark.integration
 def test_the_same_arguments_give_the_same_views_and_another_seed_others(kinematics, checker):
     one, same, other = (views_of(kinematics, checker, flat_board(0.495, 0.10), seed=seed) for seed in (0, 0, 1))
     assert all(np.array_equal(a.q, b.q) for a, b in zip(one, same, strict=True))
     assert not all(np.array_equal(a.q, b.q) for a, b in zip(one, other, strict=True))
 
 
+@pytest.mark.integration
 def test_views_keep_a_distance_from_existing_ones(kinematics, checker):
     existing = [view.T_base_camera for view in views_of(kinematics, checker, flat_board(0.495, 0.10))]
     more = views_of(kinematics, checker, flat_board(0.495, 0.10), existing=existing, config=replace(CONFIG, n=3))
@@ -130,6 +133,7 @@ def test_obstacles_on_the_table_are_avoided(kinematics, checker):
     assert plan_free_motion(walled, HOME, q, limits) is None
 
 
+@pytest.mark.integration
 def test_free_motion_ends_at_rest_at_its_goal(kinematics, checker):
     view = views_of(kinematics, checker, flat_board(0.495, 0.10))[-1]
     motion = plan_free_motion(checker, HOME, view.q, MotionLimits())
@@ -155,6 +159,7 @@ def test_values_out_of_range_are_rejected(wrong: dict):
         ViewpointConfig(**wrong)
 
 
+@pytest.mark.integration
 def test_joints_follow_the_assumed_extrinsics(kinematics, checker):
     moved = z1.T_FLANGE_CAMERA.copy()
     moved[:3, 3] += [0.0, 0.01, 0.0]

@@ -71,6 +71,7 @@ def pivots_at(x: float, y: float, z: float) -> tuple[np.ndarray, float]:
     return grasp.T_base_pivot[None], grasp.jaw_open
 
 
+@pytest.mark.integration
 def test_jaws_that_come_too_near_to_the_table_while_they_close_are_found(checker, kinematics):
     rejections = []
     for z in np.arange(0.11, 0.0, -0.01):

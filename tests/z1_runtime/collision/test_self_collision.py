@@ -28,6 +28,7 @@ def checker(kinematics) -> CollisionChecker:
     return make_checker(kinematics, make_observation(T_base_camera, cylinder(0.48, 0.0, T_base_camera[:3, 3])))
 
 
+@pytest.mark.integration
 def test_the_link_capsules_contain_the_meshes_to_a_centimetre():
     for number in range(6):
         vertices = trimesh.load_mesh(z1.mesh_dir() / "collision" / f"z1_Link0{number}.STL").vertices

@@ -52,6 +52,7 @@ def test_an_empty_cloud_is_never_hit():
     assert not index.near(np.zeros((5, 3)), 0.002).any()
 
 
+@pytest.mark.integration
 @settings(max_examples=150)
 @given(
     st.integers(0, 2**32 - 1),

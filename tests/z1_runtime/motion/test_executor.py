@@ -54,6 +54,7 @@ def test_a_motion_is_played_to_its_end_and_takes_as_long_as_planned(bench, execu
     assert bench.servo.status().finished
 
 
+@pytest.mark.integration
 def test_motions_follow_each_other_without_a_gap_in_their_numbers(bench, executor):
     for motion in (MOVE, hold(Q_GOAL, 0.1), joint_move(Q_GOAL, Q_START)):
         executor.execute(motion)
@@ -81,6 +82,7 @@ def test_a_stop_in_mid_motion_is_an_error_and_leaves_the_arm_at_rest(bench, exec
     assert bench.servo.status().mode is ServoMode.STOPPED
 
 
+@pytest.mark.integration
 def test_nothing_moves_while_the_stop_is_latched_and_motions_run_after_rearming(bench, executor):
     bench.servo.stop("red button")
     bench.wait(0.1)
@@ -178,6 +180,7 @@ def test_a_servo_whose_ticks_end_is_noticed_with_and_without_watchers(bench, exe
         watched.execute(MOVE)
 
 
+@pytest.mark.integration
 def test_an_arm_that_will_not_rest_is_named(bench, executor):
     rng = np.random.default_rng(0)
 

@@ -57,6 +57,7 @@ def play(late_s: list[float], config: SenderConfig) -> Bench:
 LATE = [0.1, 0.15, 0.22, 0.3, 0.35, 0.3]
 
 
+@pytest.mark.integration
 def test_a_lead_that_adapts_carries_a_motion_over_pauses_that_drop_it_otherwise() -> None:
     fixed = play(LATE, SenderConfig(max_lead_s=SenderConfig().lead_s))
     assert not fixed.servo.status().finished

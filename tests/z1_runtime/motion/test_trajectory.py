@@ -205,6 +205,7 @@ def test_joints_outside_the_limits_are_rejected_by_name(end: str, value: float) 
 BEYOND_RAD = st.floats(0.0, LIMIT_TOLERANCE_RAD)
 
 
+@pytest.mark.integration
 @given(hnp.arrays(np.bool_, z1.N_JOINTS), BEYOND_RAD, BEYOND_RAD)
 def test_joints_a_hair_beyond_the_limits_are_clipped(upper: np.ndarray, start_rad: float, goal_rad: float) -> None:
     at_limit, sign = np.where(upper, z1.Q_MAX, z1.Q_MIN), np.where(upper, 1.0, -1.0)

@@ -96,6 +96,7 @@ def test_two_objects_are_two_and_the_larger_comes_first():
     assert iou(found[0].mask, truth(frame)) >= 0.9
 
 
+@pytest.mark.integration
 def test_one_object_half_behind_another_stays_apart():
     scene = [Cylinder(0.42, 0.0, 0.03, 0.1), Cylinder(0.56, 0.02, 0.0325, 0.2)]
     depth, which = cast(scene)

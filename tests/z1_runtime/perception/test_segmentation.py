@@ -49,6 +49,7 @@ class Fixed:
         return self._detections
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("detector", [TabletopDetector(), GroundTruthDetector()])
 @pytest.mark.parametrize("target", [BOTTLE, BOX, Cylinder(0.56, 0.15, 0.0325, 0.2)])
 def test_the_objects_cloud_covers_the_object_and_nothing_else(target, detector):
@@ -60,6 +61,7 @@ def test_the_objects_cloud_covers_the_object_and_nothing_else(target, detector):
     assert (KDTree(seen.object_points).query(exact)[0] < 0.006).mean() >= 0.9
 
 
+@pytest.mark.integration
 def test_the_objects_cloud_holds_no_table():
     seen = make().observe(noisy_frame([BOX]), T_BASE_FLANGE, JAW)
     heights = transform_points(T_base_camera(), seen.object_points)[:, 2]
@@ -68,6 +70,7 @@ def test_the_objects_cloud_holds_no_table():
     assert heights.max() == pytest.approx(0.18, abs=0.008)
 
 
+@pytest.mark.integration
 def test_a_box_without_a_mask_gives_the_object_too_and_leaves_its_table_in_the_scene():
     frame = noisy_frame([BOX])
     by_mask = make(GroundTruthDetector()).observe(frame, T_BASE_FLANGE, JAW)
@@ -79,6 +82,7 @@ def test_a_box_without_a_mask_gives_the_object_too_and_leaves_its_table_in_the_s
     assert len(by_box.scene_points) == pytest.approx(len(by_mask.scene_points), rel=0.01)
 
 
+@pytest.mark.integration
 def test_the_scene_is_the_rest_at_full_resolution():
     scene = [BOTTLE, Box(0.56, -0.12, (0.05, 0.05, 0.1))]
     frame = noisy_frame(scene)
@@ -89,6 +93,7 @@ def test_the_scene_is_the_rest_at_full_resolution():
     assert 0.9 * measured < len(seen.scene_points) + truth(frame).sum() < 1.05 * measured
 
 
+@pytest.mark.integration
 def test_no_scene_point_hangs_around_the_object():
     seen = make().observe(noisy_frame([BOTTLE]), T_BASE_FLANGE, JAW)
     p_base = transform_points(T_base_camera(), seen.scene_points)
@@ -96,6 +101,7 @@ def test_no_scene_point_hangs_around_the_object():
     assert (p_base[around, 2] > 0.015).sum() <= 5
 
 
+@pytest.mark.integration
 def test_the_table_comes_in_the_camera_frame():
     seen = make().observe(noisy_frame([BOTTLE]), T_BASE_FLANGE, JAW)
     T = T_base_camera()
@@ -103,6 +109,7 @@ def test_the_table_comes_in_the_camera_frame():
     assert seen.table.height_m(np.zeros((1, 3)))[0] == pytest.approx(T[2, 3], abs=0.001)
 
 
+@pytest.mark.integration
 def test_observe_is_detect_and_then_segment_bit_by_bit():
     frame, perception = noisy_frame([BOTTLE]), make()
     whole = perception.observe(frame, T_BASE_FLANGE, JAW)
@@ -152,6 +159,7 @@ def test_a_class_that_the_detector_does_not_know_is_rejected():
         make(Fixed()).detect(filtered(noisy_frame([BOTTLE])), T_base_camera(), "box")
 
 
+@pytest.mark.integration
 def test_the_crop_may_be_the_box_as_in_the_paper():
     frame = noisy_frame([BOTTLE])
     mask = truth(frame).copy()
@@ -196,6 +204,7 @@ def test_every_error_is_a_perception_error():
     assert issubclass(PerceptionError, RuntimeError)
 
 
+@pytest.mark.integration
 def test_without_voxels_the_cloud_holds_measured_points_only():
     frame = noisy_frame([BOTTLE])
     seen = make(voxel_m=0.0).observe(frame, T_BASE_FLANGE, JAW)

@@ -36,6 +36,7 @@ def perceive(objects, jaw=JAW, seed=0):
     )
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("jaw", [z1.GRIPPER_OPEN, JAW, -0.4, z1.GRIPPER_CLOSED])
 def test_every_pixel_of_the_gripper_is_masked_at_any_opening(jaw):
     alone = gripper_depth(jaw)
@@ -70,6 +71,7 @@ def test_the_background_of_the_jaws_is_kept():
     np.testing.assert_array_equal(behind, depth)
 
 
+@pytest.mark.integration
 def test_the_robots_own_jaws_are_neither_object_nor_scene():
     with pytest.raises(NoDetectionError):
         perceive([])
@@ -80,6 +82,7 @@ def test_the_robots_own_jaws_are_neither_object_nor_scene():
         assert points[:, 2].min() > jaws[:, 2].max()
 
 
+@pytest.mark.integration
 def test_the_frame_that_is_shown_keeps_its_depth():
     exact = before(gripper_depth(JAW), cast([Cylinder(0.5, 0.0, 0.0325, 0.2)])[0])
     frame = frame_of(d405(exact, 0))

@@ -84,6 +84,7 @@ def test_the_least_squares_pose_is_only_used_without_an_exact_solution(in_the_op
     assert rejection.reason is RejectionReason.IK
 
 
+@pytest.mark.integration
 @settings(max_examples=25, deadline=None)
 @given(
     st.one_of(st.floats(1e-4, 0.018), st.floats(0.075, 0.1)),

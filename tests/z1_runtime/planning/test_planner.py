@@ -154,6 +154,7 @@ def test_a_grasp_that_would_push_the_object_is_rejected_as_object(planner, kinem
     assert reason == "object"
 
 
+@pytest.mark.integration
 def test_a_wall_before_the_object_blocks_every_grasp(planner, kinematics):
     observation = scene(kinematics, 0.56, 0.0, wall(0.42, 0.0, height=0.45))
     reasons = rejections(planner, candidates(observation, 0.56, 0.0), observation)

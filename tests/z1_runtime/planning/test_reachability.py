@@ -73,6 +73,7 @@ def test_between_equal_poses_the_generators_score_decides(planner, observation):
     assert high - low == pytest.approx(0.999 * planner.config.reachability.generator * 0.7)
 
 
+@pytest.mark.integration
 def test_the_first_in_that_order_is_the_one_that_is_executed(planner, observation):
     rng = np.random.default_rng(0)
     grasps = [frontal(*AT, rng.uniform(0.04, 0.14), rng.uniform(-0.5, 1.4), rng.uniform(-2.5, 2.5)) for _ in range(60)]

@@ -64,6 +64,7 @@ def with_part(selector: GraspSelector, **part) -> GraspSelector:
     return GraspSelector(**(parts | part))
 
 
+@pytest.mark.integration
 def test_the_drawn_can_has_the_measures_of_its_parameters(selection, T_base_camera):
     points = transform_points(T_base_camera, selection.observation.object_points)
     assert np.abs(np.hypot(points[:, 0] - 0.48, points[:, 1]) - 0.03).mean() < 0.003
@@ -93,6 +94,7 @@ def test_every_stage_is_timed_and_the_total_holds_them_all(selection):
     assert 0.0 < parts <= selection.stage_ms["total"]
 
 
+@pytest.mark.integration
 def test_the_box_filters_the_candidates_by_the_configuration(selector, selection, T_base_camera):
     assert len(selection.grasps) == CONFIG.n_candidates
     box = fit_obb(selection.observation.object_points, CONFIG.box_method, up=T_base_camera[2, :3])

@@ -136,6 +136,7 @@ def test_a_pick_that_holds_is_not_repeated(selector, can):
     assert cell.ended == PHASES
 
 
+@pytest.mark.integration
 def test_a_pick_with_an_object_in_the_jaws_is_rejected_before_anything_moves(selector, can):
     cell = Cell(selector, can)
     cell.after = lambda name: cell.bench.mock.block(z1.N_ARM) if name == "approach" else None
@@ -147,6 +148,7 @@ def test_a_pick_with_an_object_in_the_jaws_is_rejected_before_anything_moves(sel
     assert cell.q == pytest.approx(lifted, abs=1e-6)
 
 
+@pytest.mark.integration
 def test_a_pick_that_may_drop_opens_the_jaws(selector, can):
     cell = Cell(selector, can)
     cell.after = lambda name: cell.bench.mock.block(z1.N_ARM if name == "approach" else None)

@@ -292,6 +292,7 @@ def test_viewer_opens_on_a_screen_and_stays_on_the_loopback(monkeypatch: pytest.
     assert command[-1] == f"rerun+http://127.0.0.1:{port}/proxy"
 
 
+@pytest.mark.integration
 def test_drawn_meshes_are_the_robot_s_within_the_grid() -> None:
     drawn = {path: entity for path, entity in RobotView().draw_links() if isinstance(entity, rr.Mesh3D)}
     for stem, link in (("z1_Link01", "link01"), ("z1_GripperMover", "gripperMover")):

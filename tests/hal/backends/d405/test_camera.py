@@ -118,6 +118,7 @@ def test_exposure_is_set_on_the_stereo_module_and_survives_a_reset(source: Plain
 # --- Faults -------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.integration
 def test_a_repeated_frame_is_not_delivered_again(source: PlainSource, camera: D405Camera) -> None:
     last = camera.wait_for_frame(1.0)
     source.repeats = source.restart_cures = True
@@ -156,6 +157,7 @@ def test_colour_of_another_instant_than_depth_is_not_delivered(source: PlainSour
     assert camera.wait_for_frame(1.0).depth_m.any()
 
 
+@pytest.mark.integration
 def test_streams_that_hang_are_restarted(source: PlainSource, camera: D405Camera) -> None:
     before = camera.wait_for_frame(1.0).sequence
     source.hangs = source.restart_cures = True
@@ -164,6 +166,7 @@ def test_streams_that_hang_are_restarted(source: PlainSource, camera: D405Camera
     assert camera.wait_for_frame(1.0).sequence > before
 
 
+@pytest.mark.integration
 def test_a_device_that_hangs_is_reset_and_reconnected(
     source: PlainSource, camera: D405Camera, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -174,6 +177,7 @@ def test_a_device_that_hangs_is_reset_and_reconnected(
     assert "its hardware was reset" in caplog.text
 
 
+@pytest.mark.integration
 @pytest.mark.faults
 def test_a_lost_camera_is_reconnected_when_it_returns(
     source: PlainSource, camera: D405Camera, faults_table: FaultsTable
@@ -201,6 +205,7 @@ def test_a_lost_camera_is_reconnected_when_it_returns(
     assert after.intrinsics == before.intrinsics
 
 
+@pytest.mark.integration
 def test_an_idle_camera_is_never_reset(source: PlainSource, camera: D405Camera) -> None:
     source.clock.sleep_until(source.clock.now_s() + 600.0)
     with pytest.raises(HalTimeoutError):
@@ -209,6 +214,7 @@ def test_an_idle_camera_is_never_reset(source: PlainSource, camera: D405Camera) 
     assert (camera.health.restarts, camera.health.resets) == (0, 0)
 
 
+@pytest.mark.integration
 @pytest.mark.faults
 def test_a_jump_of_the_systems_time_does_not_stop_it(
     source: PlainSource,
@@ -264,6 +270,7 @@ def test_another_serial_number_is_named(source: PlainSource) -> None:
         assert f"found {d405.NAME} {rs.SERIAL}" in str(caught.value)
 
 
+@pytest.mark.integration
 def test_one_of_two_cameras_must_be_chosen(source: PlainSource) -> None:
     with rs.plugged(source), rs.plugged(PlainSource(source.clock), "000000000406"):
         camera = D405Camera(SMALL, clock=source.clock)
@@ -288,6 +295,7 @@ def test_a_camera_that_only_the_kernel_lists_needs_udev_rules(source: PlainSourc
         assert "USB 3 port" in describe_missing(rs, "", tmp_path / "2-1")
 
 
+@pytest.mark.integration
 def test_a_camera_on_usb_2_is_reported(
     source: PlainSource, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:

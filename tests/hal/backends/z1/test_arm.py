@@ -224,6 +224,7 @@ def test_no_joint_is_commanded_beyond_its_limits(mode: Z1Mode) -> None:
     assert np.abs([c.dq for c in commands]).max() <= z1.DQ_MAX.max() + 1e-6
 
 
+@pytest.mark.integration
 def test_no_torque_beyond_the_effort_limits_leaves_the_driver(low: Bench) -> None:
     rng = np.random.default_rng(0)
     for _ in range(500):
@@ -234,6 +235,7 @@ def test_no_torque_beyond_the_effort_limits_leaves_the_driver(low: Bench) -> Non
     assert (low.peer.highest_torque[:6] > 0.9 * limit[:6]).all()
 
 
+@pytest.mark.integration
 def test_the_lead_over_a_blocked_arm_is_bounded(bench: Bench) -> None:
     bench.peer.stuck, bench.peer.noise_rad = 0, 1e-6
     bench.run(bench.shift(0, 1.5), 1.0)
@@ -241,6 +243,7 @@ def test_the_lead_over_a_blocked_arm_is_bounded(bench: Bench) -> None:
     assert abs(target - bench.peer.q[0]) == pytest.approx(0.35, abs=1e-3)
 
 
+@pytest.mark.integration
 def test_low_level_mode_carries_the_arm(low: Bench) -> None:
     held = low.peer.q.copy()
     low.run(held, 1.0)
@@ -465,6 +468,7 @@ def test_a_controller_that_falls_silent_is_detected(bench: Bench) -> None:
     bench.run(q, 0.1)
 
 
+@pytest.mark.integration
 def test_a_silent_motor_board_is_detected_only_during_a_commanded_motion(bench: Bench) -> None:
     q = bench.peer.q.copy()
     bench.peer.silence_board(True)
@@ -576,6 +580,7 @@ def play(bench: Bench, inject_fault: Callable[[], None]) -> Servo:
     return servo
 
 
+@pytest.mark.integration
 def test_a_trajectory_is_executed_to_its_end() -> None:
     bench = make_bench()
     servo = play(bench, lambda: None)
@@ -592,6 +597,7 @@ def test_a_motor_fault_latches_the_servo_during_the_motion() -> None:
     assert 0.2 < bench.peer.q[0] < 0.6
 
 
+@pytest.mark.integration
 def test_a_motor_board_that_falls_silent_latches_the_servo() -> None:
     bench = make_bench()
     servo = play(bench, lambda: bench.peer.silence_board(True))
@@ -599,6 +605,7 @@ def test_a_motor_board_that_falls_silent_latches_the_servo() -> None:
     assert "repeated one measurement" in servo.status().reason
 
 
+@pytest.mark.integration
 def test_a_controller_that_ends_latches_the_servo() -> None:
     bench = make_bench()
     servo = play(bench, lambda: setattr(bench.peer, "mute", True))

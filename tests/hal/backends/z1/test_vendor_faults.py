@@ -35,6 +35,7 @@ def hold(bench: WireBench, duration_s: float) -> list[int]:
     return backlog
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("leave", ["enter", "disconnect"])
 def test_leaving_low_level_moves_nothing(leave: str) -> None:
     """The controller obeys the body of a state request for a cycle, and then starts from it."""
@@ -56,6 +57,7 @@ def test_leaving_low_level_moves_nothing(leave: str) -> None:
     assert moved.max() < _MOVED_RAD
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("mode", [Z1Mode.TRACKING, Z1Mode.LOW_LEVEL])
 def test_the_commands_never_queue_up(mode: Z1Mode) -> None:
     """The controller reads one datagram a cycle; every further one delays all later commands by a cycle."""

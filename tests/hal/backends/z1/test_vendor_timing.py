@@ -81,6 +81,7 @@ def test_no_way_out_of_low_level_jerks_the_arm(leave: str) -> None:
         assert np.abs(bench.peer.q - before).max() + settle(bench) < 0.02
 
 
+@pytest.mark.integration
 def test_a_stream_of_setpoints_builds_no_backlog() -> None:
     bench = make_bench()
     bench.arm.connect()
@@ -90,6 +91,7 @@ def test_a_stream_of_setpoints_builds_no_backlog() -> None:
     assert len(bench.peer.read) > 0.9 * 6.0 / PERIOD_S
 
 
+@pytest.mark.integration
 def test_the_command_latency_is_measured_and_the_newest_setpoint_is_sent() -> None:
     bench = make_bench()
     bench.arm.connect()

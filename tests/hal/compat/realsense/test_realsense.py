@@ -399,6 +399,7 @@ def test_errors_of_use_read_as_the_librarys(twin: rs.TwinDevice) -> None:
     assert text_of(lambda: rs.pipeline().start(mixed)) == "Couldn't resolve requests"
 
 
+@pytest.mark.integration
 def test_a_timeout_reads_as_the_librarys_and_takes_only_the_twins_time(
     source: PlainSource, twin: rs.TwinDevice
 ) -> None:

@@ -106,6 +106,7 @@ def test_impossible_requests_return_false_and_are_logged(
     assert peer.fsm is Fsm.JOINTCTRL
 
 
+@pytest.mark.integration
 def test_moves_reach_their_goals_with_and_without_the_gripper(arm: ArmInterface, peer: FakeController) -> None:
     arm.labelRun("forward")
     assert arm.MoveJ(np.array([0.5, 0.1, 0.1, 0.5, -0.2, 0.5]), -1.0, 1.0)
@@ -185,6 +186,7 @@ def test_the_posture_is_jogged_and_stops_without_commands(
     assert peer.pose() == pytest.approx(rest, abs=1e-4)
 
 
+@pytest.mark.integration
 def test_low_level_commands_reach_the_motors_within_their_limits(
     arm: ArmInterface, peer: FakeController, clock: ManualClock
 ) -> None:

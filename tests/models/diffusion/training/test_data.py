@@ -35,6 +35,7 @@ def test_only_a_symmetric_gripper_is_turned_over():
         assert same_side.all() != symmetric
 
 
+@pytest.mark.integration
 def test_ground_truth_in_the_view_frame_is_valid_on_the_solid(data):
     T, widths = data.draw_grasps(np.arange(8), 30, np.random.default_rng(0))
     for view in range(8):

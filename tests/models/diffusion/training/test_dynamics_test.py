@@ -65,6 +65,7 @@ def test_grasps_on_nothing_or_in_collision_are_lost_without_simulation():
     assert not simulate(BRICK, T).any()
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("family", ["bottle", "cup", "union", "mug"])
 def test_nearly_all_labels_hold_in_the_dynamics_test(family):
     rng = np.random.default_rng(3)

@@ -111,6 +111,7 @@ def test_a_gripper_with_impossible_sizes_is_rejected():
         ParallelGripperSpec(name="odd", max_width_m=0.001)
 
 
+@pytest.mark.integration
 def test_every_family_can_be_made_and_grasped_and_none_is_in_both_sets():
     assert not set(KNOWN_FAMILIES) & set(HELD_OUT_FAMILIES)
     assert set(FAMILY_WEIGHTS) == set(KNOWN_FAMILIES)

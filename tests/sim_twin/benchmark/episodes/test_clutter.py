@@ -29,6 +29,7 @@ def footprint(scene):
     return [(T[:2, 3], np.hypot(*(grasp_object.corners() @ T[:3, :3].T)[:, :2].T).max()) for T, grasp_object in things]
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("count", [1, 2, 3])
 def test_neighbours_stand_apart_from_the_object_and_from_each_other_and_not_before_it(count):
     for scenario in grid(clutters=(count,)):
@@ -55,6 +56,7 @@ def test_the_extended_sets_neighbours_are_of_that_set():
         assert {n.object for n in scenario.scene().neighbours} <= set(EXTENDED_OBJECTS)
 
 
+@pytest.mark.integration
 def test_neighbours_stand_and_one_that_is_pushed_over_is_counted():
     world = World(CLUTTERED.scene())
     watch = ContactMonitor(world)

@@ -13,6 +13,8 @@ from z1_runtime.config import RuntimeConfig
 from z1_runtime.factory import make_grasp_selector
 from z1_runtime.grasping.ranking import FEATURES
 
+pytestmark = pytest.mark.integration
+
 CONFIG = RuntimeConfig(generator="antipodal", detector="tabletop", n_candidates=400)
 SCENARIO = Scenario(object="cylinder", distance="mid", lateral="centre", pitch_deg=0.0)
 
@@ -27,7 +29,6 @@ def rows(selector):
     return run_scenario(SCENARIO, list(METHODS.values()), lambda *_: selector)
 
 
-@pytest.mark.integration
 def test_every_method_has_a_row_from_the_same_candidates(rows):
     assert [row["method"] for row in rows] == list(METHODS)
     assert len({row["n_candidates"] for row in rows}) == 1
@@ -61,7 +62,6 @@ def test_a_row_holds_what_a_scoring_head_is_fitted_to(rows, selector):
     assert rows[1]["first_candidate"] == rows[1]["candidate"] or rows[1]["rank"] > 0
 
 
-@pytest.mark.integration
 def test_an_object_that_is_not_where_it_was_seen_is_not_called_lifted(selector):
     frame, q = capture(SCENARIO.scene())
     plan = selector.select(frame, q).plan
@@ -72,7 +72,6 @@ def test_an_object_that_is_not_where_it_was_seen_is_not_called_lifted(selector):
     assert outcome.lifted_m < 0.01
 
 
-@pytest.mark.integration
 def test_an_object_that_cannot_be_seen_is_a_row_too(selector):
     hidden = replace(SCENARIO, occlusion=0.99)
     (row,) = run_scenario(hidden, [METHODS["mvb"]], lambda *_: selector)

@@ -51,6 +51,7 @@ def test_without_noise_nothing_is_off():
     np.testing.assert_array_equal(plain.scene().T_flange_camera(), z1.T_FLANGE_CAMERA)
 
 
+@pytest.mark.integration
 def test_actuation_latency_delays_setpoints_but_not_the_stop():
     world = World(SceneConfig(arm_latency_s=0.01))
     arm = TwinArm(world)

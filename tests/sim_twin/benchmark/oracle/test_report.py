@@ -51,6 +51,7 @@ def test_neighbours_of_another_seed_are_another_scene():
     assert summarise(rows, bench)["methods"] == {}
 
 
+@pytest.mark.integration
 def test_the_page_shows_a_grid_for_each_object_and_pitch_and_what_failed(tmp_path):
     rows = make_rows()
     summary = write_summary(rows, tmp_path / "summary.json", {"version": "1"}, rows)

@@ -66,6 +66,7 @@ def test_grasps_come_from_all_sides_but_from_below_with_contacts_on_the_surface(
         assert np.abs(np.abs(contacts / [0.035, 0.020, 0.075]).max(axis=1) - 1.0).max() < 1e-6
 
 
+@pytest.mark.integration
 def test_after_a_failure_what_is_unlike_it_comes_next_and_copies_never(find_grasps):
     tried = []
     while (option := find_grasps.next()) is not None:
@@ -84,6 +85,7 @@ def _spread(some):
     return np.linalg.norm(traits[:, None] - traits[None], axis=2).mean()
 
 
+@pytest.mark.integration
 def test_a_finer_sweep_remembers_what_failed(find_grasps):
     truth = GroundTruthScene(BOX.scene(), Kinematics(), EXACT_PLANNER, 0.5)
     first, again = truth.find_grasps(FEW), truth.find_grasps(FEW)

@@ -28,6 +28,7 @@ def test_a_row_says_which_scenario_it_is():
         assert Scenario.from_row(scenario.columns() | {"method": "mvb"}) == scenario
 
 
+@pytest.mark.integration
 def test_the_final_state_is_drawn_from_the_row(tmp_path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("Z1_TWIN_RENDER", "rays")
     monkeypatch.setattr(pictures, "_SIZE", (240, 135))

@@ -81,6 +81,7 @@ def test_methods_stand_in_their_order_whatever_the_rows(tmp_path):
     assert re.findall(r"<tr><td>([^<]*)</td><td>81</td>", page) == ["vanilla", "mvb:k=3", "mvb", "full"]
 
 
+@pytest.mark.integration
 def test_a_count_that_was_never_made_is_no_count(tmp_path):
     rows = [row | {"n_free": -1} for row in make_rows(("mvb",))]
     line = next(
@@ -162,6 +163,7 @@ def test_the_papers_known_figures_are_next_to_ours(page):
     assert re.findall("<td>the paper&#39;s</td><td></td>(.*)", tables)[0].count("–") == len(STAGES) + 1 - 3
 
 
+@pytest.mark.integration
 def test_tables_give_the_rate_of_each_condition(tmp_path):
     rows = make_rows(("mvb",))
     page = write(tmp_path / "report.html", rows)

@@ -20,6 +20,7 @@ def test_wilson_stays_inside_0_to_1_at_the_ends():
     assert wilson(0, 0) == (0.0, 1.0)
 
 
+@pytest.mark.integration
 def test_wilson_equals_the_formula():
     z = 1.959964  # 97.5 % quantile of the normal distribution
     for trials in (1, 7, 81, 243):

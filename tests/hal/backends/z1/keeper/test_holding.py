@@ -69,6 +69,7 @@ def test_without_a_keeper_a_silent_driver_lets_the_arm_sink(bench: Bench) -> Non
     assert bench.peer.fsm is Fsm.PASSIVE
 
 
+@pytest.mark.integration
 def test_a_silent_driver_is_stood_in_for_and_goes_on_afterwards(bench: Bench) -> None:
     bench.run(0.3)
     state = bench.peer.fsm
@@ -82,6 +83,7 @@ def test_a_silent_driver_is_stood_in_for_and_goes_on_afterwards(bench: Bench) ->
     assert bench.keeper.stepped_in == stood_in
 
 
+@pytest.mark.integration
 def test_a_driver_that_ends_in_motion_leaves_an_arm_that_is_held(bench: Bench) -> None:
     goal = bench.arm.read_state().q.copy()
     goal[0] += 1.0
@@ -92,6 +94,7 @@ def test_a_driver_that_ends_in_motion_leaves_an_arm_that_is_held(bench: Bench) -
     assert bench.peer.fsm is Fsm.JOINTCTRL
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("end", ["killed", "silent"])
 def test_a_torque_without_stiffness_ends_with_its_driver(end: str) -> None:
     bench = Bench(Z1Mode.LOW_LEVEL)
@@ -138,6 +141,7 @@ def test_a_release_lets_the_arm_sink_and_ends_the_keeper(bench: Bench) -> None:
     assert bench.keeper.phase is Phase.ENDED
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("gone", ["limp", "silent"])
 def test_the_keeper_ends_when_there_is_nothing_to_hold(gone: str) -> None:
     bench = Bench()
