@@ -3,6 +3,7 @@ import re
 from xml.etree import ElementTree
 
 import numpy as np
+import pytest
 
 from sim_twin.benchmark.episodes.scenarios import grid
 from sim_twin.benchmark.oracle.report import summarise, write_report, write_summary
