@@ -15,6 +15,8 @@ from tests.support.vendor.observations import LONG, SHORT, Observation, Observer
 from tests.support.vendor.probe import Probe
 from tests.support.vendor.table import Pair
 
+pytestmark = pytest.mark.integration
+
 MEASURED = Path(program.__file__).parent / "measured.json"
 """Observations of the vendor's controller, built from its public source, with the board twin below it."""
 
@@ -35,7 +37,6 @@ def test_the_twin_behaves_as_the_vendors_controller_was_measured(observe: Observ
 
 
 @pytest.mark.vendor
-@pytest.mark.integration
 @pytest.mark.timeout(1800)
 def test_the_twin_behaves_as_the_vendors_program(request: pytest.FixtureRequest, vendor_table: list[Pair]) -> None:
     if not (path := os.environ.get("Z1_CTRL")):

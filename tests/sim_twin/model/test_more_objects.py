@@ -8,6 +8,8 @@ from sim_twin.model.parts import make_homogeneous_lathe, make_wall
 from sim_twin.model.scene import SceneConfig
 from sim_twin.model.world import World
 
+pytestmark = pytest.mark.integration
+
 _RGBA = (0.5, 0.5, 0.5, 1.0)
 
 
@@ -16,7 +18,6 @@ def world(request: pytest.FixtureRequest) -> World:
     return World(SceneConfig(object=request.param))
 
 
-@pytest.mark.integration
 def test_it_stays_upright(world: World) -> None:
     start = world.config.T_base_object()
     world.advance_to(1.0)
@@ -26,7 +27,6 @@ def test_it_stays_upright(world: World) -> None:
     assert np.abs(world.data.qvel[-6:]).max() < 1e-2
 
 
-@pytest.mark.integration
 def test_it_is_drawn_at_its_pose(world: World) -> None:
     renderer = make_renderer(world.model, INTRINSICS, "rays")
     data = world.snapshot()

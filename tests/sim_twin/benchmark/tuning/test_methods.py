@@ -16,6 +16,8 @@ from z1_runtime.factory import draw_can, make_grasp_selector
 from z1_runtime.grasping.ranking import Ranking, Scoring, ScoringError, ScoringHead, measure_features, save_scoring
 from z1_runtime.tasks.grasp_selection import StageTimes
 
+pytestmark = pytest.mark.integration
+
 HEAD = ScoringHead(features=("above_m",), mean=(0.0,), scale=(0.01,), coefficients=(1.0,), intercept=0.0)
 Q = np.append(z1.Q_HOME, -1.0)
 
@@ -64,7 +66,6 @@ def test_invalid_methods_are_rejected(tmp_path):
         parse_method("vanilla:k=2")
 
 
-@pytest.mark.integration
 def test_full_uses_its_settings_and_else_the_configurations(seen, selector):
     configured, one = METHODS["full"].ranking(selector.ranking), parse_method("full:k=1").ranking(selector.ranking)
     assert configured == selector.ranking
