@@ -69,7 +69,9 @@ class CommandWriter:
         q = np.append(measured[:_GRIPPER], self._client.posture().q[_GRIPPER])
         self.q_sent = self._still_q = self._q_wire = q if mode is Z1Mode.TRACKING else measured
         # A client that starts from the measurement, as after a change of drivers, must not let go of an object.
-        self._held_jaw = (measured[_GRIPPER], q[_GRIPPER]) if mode is Z1Mode.TRACKING else None
+        # Only closing torque is a grip.
+        grips = mode is Z1Mode.TRACKING and q[_GRIPPER] > measured[_GRIPPER]
+        self._held_jaw = (measured[_GRIPPER], q[_GRIPPER]) if grips else None
         self._still_s = self._client.newest_s
 
     def write_hold(self) -> None:
