@@ -69,9 +69,7 @@ class CommandWriter:
         q = np.append(measured[:_GRIPPER], self._client.posture().q[_GRIPPER])
         self.q_sent = self._still_q = self._q_wire = q if mode is Z1Mode.TRACKING else measured
         # A client that starts from the measurement, as after a change of drivers, must not let go of an object.
-        # Only closing torque is a grip.
-        grips = mode is Z1Mode.TRACKING and q[_GRIPPER] > measured[_GRIPPER]
-        self._held_jaw = (measured[_GRIPPER], q[_GRIPPER]) if grips else None
+        self._held_jaw = (measured[_GRIPPER], q[_GRIPPER]) if mode is Z1Mode.TRACKING else None
         self._still_s = self._client.newest_s
 
     def write_hold(self) -> None:
@@ -92,7 +90,8 @@ class CommandWriter:
             q[_GRIPPER], dq[_GRIPPER] = measured[_GRIPPER] + self.grip_nm / z1.KP[_GRIPPER], 0.0
         elif self._held_jaw is not None:
             found, held = self._held_jaw
-            if abs(q[_GRIPPER] - found) < _SAME_JAW_RAD:
+            # By its speed too: a servo steps from the position that was applied, which would never get away.
+            if dq[_GRIPPER] == 0.0 and abs(q[_GRIPPER] - found) < _SAME_JAW_RAD:
                 q = np.append(q[:_GRIPPER], held)
             else:
                 self._held_jaw = None

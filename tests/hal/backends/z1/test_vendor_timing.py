@@ -13,13 +13,15 @@ from hal.backends.z1.requests import RequestPhase
 from hal.base import z1
 from hal.base.clock import ManualClock
 from hal.base.errors import CommandRejectedError, HalTimeoutError
-from hal.base.messages import ArmSetpoint, ServoMode
+from hal.base.messages import ArmSetpoint, ServoMode, TrajectoryChunk
 from hal.bus.health import describe_health
 from hal.servo.servo import Servo
 from hal.z1_protocol.controller import LABELS, TrajectoryCommand, encode_command
 from hal.z1_protocol.states import Fsm
 from tests.support.errors import raises
 from tests.support.hal.vendor_controller import CYCLE_S, VendorController, VendorLink
+from z1_runtime.motion.limits import MotionLimits
+from z1_runtime.motion.trajectory import joint_move
 
 REST = np.zeros(z1.N_JOINTS)
 PERIOD_S = z1.CONTROL_PERIOD_S
@@ -290,3 +292,27 @@ def test_the_latency_is_part_of_the_servos_health() -> None:
     health = servo.health()
     assert 0.0 < health.command_latency_ms_p50 <= health.command_latency_ms_p99 <= health.command_latency_ms_max
     assert "command latency p50" in describe_health(health)
+
+
+@pytest.mark.parametrize("opening_rad", [-0.5, 0.2])
+@pytest.mark.parametrize("torque_nm", [2.0, 0.5, -0.4])
+@pytest.mark.parametrize("speed", [0.05, 1.0])
+def test_a_kept_grip_ends_when_a_motion_moves_the_jaw(opening_rad: float, torque_nm: float, speed: float) -> None:
+    bench = make_bench()
+    bench.peer.stuck, bench.peer.fsm = 6, Fsm.JOINTCTRL
+    bench.peer.q[6] = -0.6
+    bench.peer.target[6] = -0.6 + torque_nm / z1.KP[6]
+    servo = Servo(bench.arm, bench.clock)
+    servo.connect()
+    servo.claim("test")
+    servo.tick()
+    bench.peer.stuck = None
+    start = servo.status().q_command
+    goal = start.copy()
+    goal[6] += opening_rad
+    move = joint_move(start, goal, MotionLimits.at_speed(speed))
+    servo.stream(TrajectoryChunk(trajectory_id=1, t_s=move.t_s, q=move.q, dq=move.dq, final=True))
+    for _ in range(round(move.duration_s / PERIOD_S) + 200):
+        servo.tick()
+        bench.clock.advance(PERIOD_S)
+    assert bench.peer.q[6] == pytest.approx(goal[6], abs=0.03)
