@@ -15,7 +15,8 @@ from threading import Thread
 from typing import NamedTuple
 
 from hal.base.errors import HalError, HalTimeoutError
-from hal.bus.runtime_files import find_file, make_runtime_folder, stop_socket_name
+from hal.base.runtime_folder import find_file, make_runtime_folder
+from hal.bus.runtime_files import stop_socket_name
 
 _LOG = logging.getLogger(__name__)
 _MAX_BYTES = 4096

@@ -12,8 +12,9 @@ import pytest
 
 from hal.base.errors import CommandRejectedError, HalError, HalTimeoutError
 from hal.base.messages import ServoMode
+from hal.base.runtime_folder import find_file, make_runtime_folder, runtime_folders
 from hal.bus.client import RemoteArm
-from hal.bus.runtime_files import find_file, make_runtime_folder, make_secret, read_secret, runtime_folders
+from hal.bus.runtime_files import make_secret, read_secret
 from hal.bus.stop_socket import StopAnswer, StopClient, StopSocket
 from tests.support.errors import raises
 from tests.support.hal.bus_hal import wait_until
@@ -26,6 +27,8 @@ def own_folder(tmp_path_factory, monkeypatch) -> Path:
     parent = Path(os.environ["XDG_RUNTIME_DIR"]) / f"own-{os.urandom(4).hex()}"
     parent.mkdir()
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(parent))
+    # Not the folders that a service would look into: this user's own HAL may have its files there
+    monkeypatch.setattr("hal.base.runtime_folder.runtime_folders", lambda: (parent / "z1",))
     return parent / "z1"
 
 
@@ -140,6 +143,8 @@ def test_links_and_open_folders_are_not_followed(own_folder, tmp_path):
     (tmp_path / "secret").chmod(0o600)
     (folder / "1.secret").symlink_to(tmp_path / "secret")
     assert read_secret(1) is None
+    make_secret(7447)
+    assert find_file("7447.secret") is not None
     folder.chmod(0o770)
     with raises(HalError, "unsafe_runtime_folder"):
         make_runtime_folder()

@@ -12,8 +12,8 @@ import pytest
 
 from hal.base.errors import HalError, StoppedError
 from hal.base.messages import ServoMode, TrajectoryChunk
+from hal.base.runtime_folder import find_file
 from hal.bus.client import RemoteArm
-from hal.bus.runtime_files import find_file
 from hal.bus.session import BusConfig
 from scripts import cli
 from scripts.commands.stop_arm import NOTHING_WAS_STOPPED

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import socket
-import stat
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from hal.base.errors import CommandRejectedError, HalError, HalTimeoutError
+from hal.base.errors import CommandRejectedError, HalTimeoutError
+from hal.base.runtime_folder import find_file, make_runtime_folder
 
 _TIMEOUT_S = 3.0
 _MAX_BYTES = 65536
@@ -33,24 +32,13 @@ class KeeperStatus:
     """Torque of the gripper [Nm]; the jaws hold something when it is more than friction."""
 
 
-def socket_path(local: tuple[str, int]) -> Path:
-    """Return the path of the socket of the keeper of the driver at address and port `local`.
+def new_socket_path(local: tuple[str, int]) -> Path:
+    """Return the path for the socket of the keeper of the driver at address and port `local`.
 
     Raises:
-        HalError: the folder of this user's sockets belongs to another user (`foreign_folder`).
+        HalError: this user has no folder for it (`no_runtime_folder`, `unsafe_runtime_folder`).
     """
-    runtime = os.environ.get("XDG_RUNTIME_DIR", "")
-    folder = Path(runtime) if runtime and Path(runtime).is_dir() else Path(f"/tmp/z1-{os.getuid()}")
-    with contextlib.suppress(FileExistsError):
-        folder.mkdir(mode=0o700)
-    found = folder.lstat()
-    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o022:
-        raise HalError(
-            f"Z1 keeper: {folder} is no folder of this user alone (owner {found.st_uid}, mode {found.st_mode:o}). "
-            f"Remove it, then try again.",
-            code="foreign_folder",
-        )
-    return folder / f"z1-keeper-{local[0]}-{local[1]}.sock"
+    return make_runtime_folder() / _socket_name(local)
 
 
 def find(local: tuple[str, int]) -> KeeperStatus | None:
@@ -86,10 +74,13 @@ def reply(connection: socket.socket, answer: KeeperStatus | str) -> None:
 
 
 def _request(local: tuple[str, int], request: str) -> dict[str, Any] | None:
+    path = find_file(_socket_name(local))
+    if path is None:
+        return None
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
         connection.settimeout(_TIMEOUT_S)
         try:
-            connection.connect(str(socket_path(local)))
+            connection.connect(str(path))
             connection.sendall(request.encode() + b"\n")
             data = b""
             while not data.endswith(b"\n") and len(data) < _MAX_BYTES and (more := connection.recv(4096)):
@@ -108,3 +99,7 @@ def _request(local: tuple[str, int], request: str) -> dict[str, Any] | None:
     if "error" in answer:
         raise CommandRejectedError(f"Z1 keeper: {answer['error']}", code="keeper_busy")
     return answer
+
+
+def _socket_name(local: tuple[str, int]) -> str:
+    return f"keeper-{local[0]}-{local[1]}.sock"

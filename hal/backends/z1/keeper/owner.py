@@ -137,7 +137,7 @@ class KeeperOwner:
             "page": self._page_file,
             "owner": theirs.fileno(),
             "owner_pid": os.getpid(),
-            "path": str(control.socket_path(self._local)),
+            "path": str(control.new_socket_path(self._local)),
         }
         process = subprocess.Popen(
             # -P: no module of the working directory takes the place of an installed one
