@@ -16,6 +16,8 @@ from ruckig import InputParameter, Ruckig, Synchronization, Trajectory
 from hal.base.z1 import CONTROL_PERIOD_S, N_JOINTS
 from hal.servo.limits import ServoLimits
 
+_SAMPLE_S = 0.005
+"""Time between two postures of a stop that are checked [s]: at full speed a joint turns 0.016 rad in it."""
 _MIN_STOP_S = 10 * CONTROL_PERIOD_S  # a stop from almost no speed still gets a few ticks to slow down in
 
 
@@ -72,10 +74,6 @@ def _sliding_max(values: np.ndarray, width: int) -> np.ndarray:
         out[:-shift] = np.maximum(out[:-shift], out[shift:])
         done += shift
     return out
-
-
-_SAMPLE_S = 0.005
-"""Time between two postures of a stop that are checked [s]: at full speed a joint turns 0.016 rad in it."""
 
 
 class MotionState(NamedTuple):
